@@ -1,0 +1,70 @@
+"""The triangle mesh that every scene becomes: positions, texture coordinates, colours and textures as arrays."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class TexturedMesh:
+    """An unlit, textured triangle mesh in the world frame (metres, Y up).
+
+    The colour of a surface point is texture x vertex colour, multiplied as they are stored (sRGB-encoded values, no
+    conversion): scanned scenes carry baked light that is meant to be shown so.
+    """
+
+    vertices: NDArray[np.float32]
+    """`(v, 3)` positions in metres."""
+    triangles: NDArray[np.int32]
+    """`(t, 3)` vertex indices."""
+    uv: NDArray[np.float32]
+    """`(v, 2)` texture coordinates; u right, v **down** (glTF's convention), repeating outside [0, 1]."""
+    colours: NDArray[np.float32]
+    """`(v, 3)` vertex colours times the material's base-colour factor, in [0, 1]; 1 where a mesh has none."""
+    texture_index: NDArray[np.int32]
+    """`(t,)` index into `textures`, -1 for none."""
+    textures: list[NDArray[np.uint8]] = field(default_factory=list)
+    """`(height, width, 3)` sRGB pictures."""
+
+    def __post_init__(self) -> None:
+        """Check the shapes, which are the contract between loaders and renderers."""
+        vertices, triangles = len(self.vertices), len(self.triangles)
+        assert self.vertices.shape == (vertices, 3), self.vertices.shape
+        assert self.triangles.shape == (triangles, 3), self.triangles.shape
+        assert self.uv.shape == (vertices, 2), self.uv.shape
+        assert self.colours.shape == (vertices, 3), self.colours.shape
+        assert self.texture_index.shape == (triangles,), self.texture_index.shape
+
+    @property
+    def bounds(self) -> NDArray[np.float32]:
+        """`(2, 3)` least and greatest corner in metres."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+
+def merge(parts: list[TexturedMesh]) -> TexturedMesh:
+    """One mesh of several; textures that are the same object are kept once."""
+    textures: list[NDArray[np.uint8]] = []
+    slot: dict[int, int] = {}
+    vertices, triangles, uv, colours, index = [], [], [], [], []
+    offset = 0
+    for part in parts:
+        for texture in part.textures:
+            if id(texture) not in slot:
+                slot[id(texture)] = len(textures)
+                textures.append(texture)
+        lookup = np.array([slot[id(texture)] for texture in part.textures] + [-1], dtype=np.int32)
+        vertices.append(part.vertices)
+        triangles.append(part.triangles + np.int32(offset))
+        uv.append(part.uv)
+        colours.append(part.colours)
+        index.append(lookup[part.texture_index])
+        offset += len(part.vertices)
+    return TexturedMesh(
+        np.concatenate(vertices),
+        np.concatenate(triangles),
+        np.concatenate(uv),
+        np.concatenate(colours),
+        np.concatenate(index),
+        textures,
+    )

@@ -1,0 +1,64 @@
+"""What the task asks of a simulator, and nothing more."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.navigation.area import NavigableArea
+from avp_habitat.poses import Intrinsics
+
+
+@dataclass(frozen=True)
+class Frames:
+    """What n cameras see."""
+
+    rgb: NDArray[np.uint8] | None
+    """`(n, height, width, 3)`, or None when not asked for."""
+    depth: NDArray[np.float32]
+    """`(n, height, width)` planar depth in metres, 0.0 where nothing was hit."""
+
+
+class Simulator(Protocol):
+    """A scene in which agents stand, walk and look."""
+
+    name: str
+    """`"raycast"` or `"habitat"`."""
+    version: str
+    """Version of the engine that renders."""
+    scene: str
+    """What the user called the scene, without folders: a file's name or `builtin:SEED`."""
+    scene_digest: str
+    """Hexadecimal SHA-256 of the scene's content."""
+    area: NavigableArea
+    """Where agents can stand."""
+
+    def render(self, camera_to_world: NDArray[np.floating], intrinsics: Intrinsics, *, rgb: bool) -> Frames:
+        """Depth, and colour when asked for, of `(n, 4, 4)` habitat poses."""
+        ...
+
+    def visible(
+        self,
+        camera_to_world: NDArray[np.floating],
+        points: NDArray[np.floating],
+        pairs: NDArray[np.integer],
+        *,
+        tolerance_m: float,
+    ) -> NDArray[np.bool_]:
+        """Whether camera rays reach points.
+
+        Args:
+            camera_to_world: `(n, 4, 4)` habitat poses.
+            points: `(m, 3)` metres, world frame.
+            pairs: `(k, 2)` rows (camera, point); the points are inside those cameras' images.
+            tolerance_m: a hit this close before the point still reaches it, in metres along the ray.
+
+        Returns:
+            `(k,)`.
+        """
+        ...
+
+    def close(self) -> None:
+        """Free what the simulator holds."""
+        ...
