@@ -1,0 +1,37 @@
+"""Reading and writing the PNG files of a rollout, with Pillow."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+DEPTH_UNIT_M = 0.001
+_MAX_STORED_DEPTH = np.iinfo(np.uint16).max
+
+
+def encode_depth(depth: NDArray[np.floating]) -> NDArray[np.uint16]:
+    """Planar depth in metres, any shape, to whole millimetres; 0 stays "nothing", 65.535 m is the greatest."""
+    return np.clip(np.rint(depth / DEPTH_UNIT_M), 0, _MAX_STORED_DEPTH).astype(np.uint16)
+
+
+def write_rgb(path: Path, rgb: NDArray[np.uint8]) -> None:
+    """Write `(height, width, 3)` uint8 as PNG."""
+    Image.fromarray(rgb, mode="RGB").save(path, format="PNG", compress_level=4)
+
+
+def write_depth(path: Path, depth: NDArray[np.floating]) -> None:
+    """Write `(height, width)` planar depth in metres as 16-bit PNG in millimetres."""
+    Image.fromarray(encode_depth(depth)).save(path, format="PNG", compress_level=4)
+
+
+def read_rgb(path: Path) -> NDArray[np.uint8]:
+    """Read a PNG as `(height, width, 3)` uint8."""
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def read_depth(path: Path) -> NDArray[np.float32]:
+    """Read a depth PNG as `(height, width)` float32 metres, 0.0 where there is none."""
+    with Image.open(path) as image:
+        return np.asarray(image, dtype=np.float32) * np.float32(DEPTH_UNIT_M)

@@ -1,0 +1,173 @@
+"""Writing a rollout folder so that it exists only when it is whole."""
+
+import csv
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat import images
+from avp_habitat.errors import RolloutError, UsageError
+from avp_habitat.poses import Intrinsics
+from avp_habitat.rollout import FORMAT, FORMAT_VERSION, HELDOUT, POSE_CONVENTION, frame_name
+
+
+class RolloutWriter:
+    """A context in which frames are written to a temporary folder, renamed to its final name by `publish`.
+
+    Leaving the context without `publish` (an error, Ctrl-C) removes the temporary folder.
+    """
+
+    def __init__(self, folder: str | Path, intrinsics: Intrinsics) -> None:
+        """Reserve a folder.
+
+        Args:
+            folder: the final name; must not exist.
+            intrinsics: of every picture.
+
+        Raises:
+            UsageError: the folder exists.
+            RolloutError: its parent cannot be written.
+        """
+        self.folder = Path(folder)
+        self.intrinsics = intrinsics
+        self._temporary = self.folder.parent / f".{self.folder.name}.partial-{os.getpid()}"
+        self._poses: dict[str, list[NDArray[np.floating]]] = {"": [], HELDOUT: []}
+        self._steps: list[dict[str, Any]] = []
+        if self.folder.exists() or self.folder.is_symlink():
+            raise UsageError(f"--out {self.folder}: exists already; choose another name or remove it")
+
+    def __enter__(self) -> "RolloutWriter":
+        """Make the temporary folder."""
+        try:
+            self._temporary.mkdir(parents=True)
+            for base in (self._temporary, self._temporary / HELDOUT):
+                for kind in ("images", "depth", "poses"):
+                    (base / kind).mkdir(parents=True)
+        except OSError as error:
+            self._discard()
+            raise self._unwritable(error) from None
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Remove what was not published; report a full or failing disk as such."""
+        self._discard()
+        if isinstance(error, OSError):
+            raise self._unwritable(error) from error
+
+    def add_frame(self, rgb: NDArray[np.uint8], depth: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
+        """Write the next captured frame: `(h, w, 3)` uint8, `(h, w)` metres, `(4, 4)` habitat camera_to_world."""
+        self._add("", rgb, depth, pose)
+
+    def add_heldout(self, rgb: NDArray[np.uint8], depth: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
+        """Write the next held-out view: `(h, w, 3)` uint8, `(h, w)` metres, `(4, 4)` habitat camera_to_world."""
+        self._add(HELDOUT, rgb, depth, pose)
+
+    def add_step(self, row: Mapping[str, Any]) -> None:
+        """Remember the next row of `steps.csv`; all rows have the same keys."""
+        self._steps.append(dict(row))
+
+    def path(self, name: str) -> Path:
+        """Where to write a further file of the folder."""
+        return self._temporary / name
+
+    def publish(self, meta: Mapping[str, Any]) -> Path:
+        """Write the tables, then give the folder its final name.
+
+        Args:
+            meta: the keys of `rollout.json` beyond format, counts, camera size and pose convention.
+
+        Raises:
+            UsageError: a folder of that name has appeared meanwhile.
+        """
+        self._write_steps()
+        self._write_json("transforms.json", self._transforms())
+        self._write_json("rollout.json", self._rollout(meta))
+        try:
+            self._temporary.rename(self.folder)
+        except OSError:
+            if self.folder.exists():
+                raise UsageError(f"--out {self.folder}: another program made it meanwhile; nothing was replaced") from None
+            raise
+        return self.folder
+
+    def _add(self, base: str, rgb: NDArray[np.uint8], depth: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
+        stem = frame_name(len(self._poses[base]))
+        images.write_rgb(self._temporary / base / "images" / f"{stem}.png", rgb)
+        images.write_depth(self._temporary / base / "depth" / f"{stem}.png", depth)
+        rows = "\n".join(" ".join(f"{value:.9f}" for value in row) for row in pose)
+        (self._temporary / base / "poses" / f"{stem}.txt").write_text(rows + "\n", encoding="ascii")
+        self._poses[base].append(np.asarray(pose, dtype=np.float64))
+
+    def _rollout(self, meta: Mapping[str, Any]) -> dict[str, Any]:
+        camera = {
+            "width": self.intrinsics.width,
+            "height": self.intrinsics.height,
+            "fx": self.intrinsics.fx,
+            "fy": self.intrinsics.fy,
+            "cx": self.intrinsics.cx,
+            "cy": self.intrinsics.cy,
+        }
+        return {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "pose_convention": POSE_CONVENTION,
+            "counts": {"frames": len(self._poses[""]), HELDOUT: len(self._poses[HELDOUT])},
+            "depth": {"unit": "millimetre", "kind": "planar z-depth", "none": 0},
+            **meta,
+            "camera": camera | dict(meta.get("camera", {})),
+        }
+
+    def _transforms(self) -> dict[str, Any]:
+        names = {
+            base: [f"{base}/images/{frame_name(i)}.png".lstrip("/") for i in range(len(poses))]
+            for base, poses in self._poses.items()
+        }
+        frames = [
+            {
+                "file_path": name,
+                "depth_file_path": name.replace("images/", "depth/"),
+                "transform_matrix": pose.tolist(),
+            }
+            for base, poses in self._poses.items()
+            for name, pose in zip(names[base], poses, strict=True)
+        ]
+        camera = self.intrinsics
+        return {
+            "camera_model": "OPENCV",
+            "w": camera.width,
+            "h": camera.height,
+            "fl_x": camera.fx,
+            "fl_y": camera.fy,
+            "cx": camera.cx,
+            "cy": camera.cy,
+            "depth_unit_scale_factor": images.DEPTH_UNIT_M,
+            "train_filenames": names[""],
+            "val_filenames": names[HELDOUT],
+            "test_filenames": names[HELDOUT],
+            "frames": frames,
+        }
+
+    def _write_steps(self) -> None:
+        with self.path("steps.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, fieldnames=list(self._steps[0]) if self._steps else [])
+            writer.writeheader()
+            writer.writerows(self._steps)
+
+    def _write_json(self, name: str, value: Mapping[str, Any]) -> None:
+        text = json.dumps(value, indent=2, allow_nan=False)
+        self.path(name).write_text(text + "\n", encoding="utf-8")
+
+    def _discard(self) -> None:
+        shutil.rmtree(self._temporary, ignore_errors=True)
+
+    def _unwritable(self, error: OSError) -> RolloutError:
+        return RolloutError(f"--out {self.folder}: cannot write there: {error.strerror or error}")
