@@ -190,7 +190,9 @@ def _check_listing(root: Path, folder: Path, suffix: str, count: int) -> None:
         with os.scandir(folder) as entries:
             found = {entry.name: entry.is_symlink() for entry in entries}
     except OSError as error:
-        raise RolloutError(f"{folder}: expected a folder of {count} files, could not list it: {error.strerror}") from None
+        raise RolloutError(
+            f"{folder}: expected a folder of {count} files, could not list it: {error.strerror}"
+        ) from None
     expected = {frame_name(index) + suffix for index in range(count)}
     if missing := sorted(expected - found.keys()):
         raise RolloutError(f"{folder / missing[0]}: expected this file ({count} frames by rollout.json), found none")
@@ -212,7 +214,9 @@ def _check_png(path: Path, intrinsics: Intrinsics, kind: tuple[int, int], wanted
     except OSError as error:
         raise RolloutError(f"{path}: expected a {wanted} PNG, could not read it: {error.strerror}") from None
     if len(header) < 26 or header[:8] != _PNG_SIGNATURE:
-        raise RolloutError(f"{path}: expected a {wanted} PNG, found {'an empty file' if not header else 'something else'}")
+        raise RolloutError(
+            f"{path}: expected a {wanted} PNG, found {'an empty file' if not header else 'something else'}"
+        )
     width, height, bits, colour = struct.unpack(">IIBB", header[16:26])
     if (width, height) != (intrinsics.width, intrinsics.height):
         raise RolloutError(

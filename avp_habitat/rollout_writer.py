@@ -95,7 +95,9 @@ class RolloutWriter:
             self._temporary.rename(self.folder)
         except OSError:
             if self.folder.exists():
-                raise UsageError(f"--out {self.folder}: another program made it meanwhile; nothing was replaced") from None
+                raise UsageError(
+                    f"--out {self.folder}: another program made it meanwhile; nothing was replaced"
+                ) from None
             raise
         return self.folder
 

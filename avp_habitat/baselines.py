@@ -1,0 +1,57 @@
+"""Policies that learn nothing, with Stable-Baselines3's `predict` interface."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.settings import ACTION_NAMES, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT
+
+CLEARANCE_M = 1.0
+"""The heuristic walks on while the depth at the image centre is above this (Eq. 23), metres."""
+
+
+class RandomPolicy:
+    """Any of the six actions, with equal odds."""
+
+    def __init__(self, seed: int | None = None) -> None:
+        """Start a random generator of its own."""
+        self._rng = np.random.default_rng(seed)
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray[np.int64], Any]:
+        """Actions for `(n, 12)` observations, `(n,)`, or for one `(12,)` observation, `()`; the state is None."""
+        return self._rng.integers(len(ACTION_NAMES), size=np.shape(observation)[:-1]), None
+
+
+class HeuristicPolicy:
+    """Forward while there is room ahead, else left or right with equal odds (Eq. 23); it uses three actions."""
+
+    def __init__(self, centre_depth: Callable[[], NDArray[np.floating]], seed: int | None = None) -> None:
+        """Use a source of depth.
+
+        Args:
+            centre_depth: gives the `(n,)` planar depth in metres in the middle of the newest views; the twelve
+                numbers do not hold it.
+            seed: of the random generator.
+        """
+        self._centre_depth = centre_depth
+        self._rng = np.random.default_rng(seed)
+
+    @classmethod
+    def for_env(cls, env: Any, seed: int | None = None) -> "HeuristicPolicy":
+        """The heuristic for an `AVPEnv` (also a wrapped one) or a vector environment of them."""
+        if hasattr(env, "get_attr"):
+            return cls(lambda: np.array(env.get_attr("centre_depth")), seed)
+        return cls(lambda: np.array([env.get_wrapper_attr("centre_depth")]), seed)
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray[np.int64], Any]:
+        """Actions for `(n, 12)` observations, `(n,)`, or for one `(12,)` observation, `()`; the state is None."""
+        depth = self._centre_depth()
+        turn = np.where(self._rng.random(len(depth)) < 0.5, TURN_LEFT, TURN_RIGHT)
+        action = np.where(depth > CLEARANCE_M, MOVE_FORWARD, turn).astype(np.int64)
+        return action.reshape(np.shape(observation)[:-1]), None

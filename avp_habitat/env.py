@@ -1,0 +1,185 @@
+"""`AVP-v0`: the task for one agent as a Gymnasium environment."""
+
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.observation import HIGH, LOW
+from avp_habitat.poses import Intrinsics
+from avp_habitat.settings import ACTION_NAMES, TaskSettings
+from avp_habitat.simulators import Frames, Simulator, make_simulator
+from avp_habitat.task import StepOutcome, ViewpointTask, episode_metrics
+
+RENDER_MODES = ("rgb_array",)
+_PICTURE = (480, 360)
+
+
+class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
+    """An agent that walks through a scene and decides which views to take.
+
+    Observations are the twelve numbers of `observation.NAMES`, actions the six of `settings.ACTION_NAMES`. `info` of
+    every step holds `coverage`, `new_cells`, `views`, `collided`, `redundant` and `reward_parts`; the last step of an
+    episode adds `avp_episode` (figures, see `task.episode_metrics`), `avp_trajectory` and `is_success`.
+    """
+
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 4}  # noqa: RUF012 - gymnasium's own declaration
+
+    def __init__(
+        self,
+        scene: str = "builtin:0",
+        *,
+        simulator: str | Simulator = "raycast",
+        render_mode: str | None = None,
+        settings: TaskSettings | None = None,
+        **overrides: Any,
+    ) -> None:
+        """Open a scene.
+
+        Args:
+            scene: a mesh file (`.glb .gltf .ply .obj`), or `builtin:SEED`.
+            simulator: `raycast`, `habitat`, or one that is open already (the scene's name is then its own).
+            render_mode: None, or `rgb_array`: the camera's picture beside the top-down map.
+            settings: of the task; the design's defaults when omitted.
+            **overrides: single fields of `TaskSettings`, for example `reward="coverage"`, `budget=60`, `width=64`.
+
+        Raises:
+            UsageError: an unknown name or a value that cannot be right.
+            SceneError: the scene cannot be used.
+            SimulatorError: the simulator cannot run here.
+        """
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise unknown_name("render_mode", render_mode, RENDER_MODES)
+        self.settings = _with_overrides(settings or TaskSettings(), overrides)
+        self.simulator = make_simulator(simulator, scene) if isinstance(simulator, str) else simulator
+        self.render_mode = render_mode
+        self.observation_space = gymnasium.spaces.Box(LOW, HIGH, dtype=np.float32)
+        self.action_space = gymnasium.spaces.Discrete(len(ACTION_NAMES))
+        self.area = self.simulator.area
+        self._task = ViewpointTask(self.simulator, self.settings, agents=1)
+        self._running = False
+
+    @property
+    def scene_name(self) -> str:
+        """What the user called the scene, without folders."""
+        return self.simulator.scene
+
+    @property
+    def scene_digest(self) -> str:
+        """Hexadecimal SHA-256 of the scene's content."""
+        return self.simulator.scene_digest
+
+    @property
+    def centre_depth(self) -> float:
+        """Planar depth in metres in the middle of the newest view."""
+        return float(self._task.centre_depth[0])
+
+    @property
+    def camera_to_world(self) -> NDArray[np.float64]:
+        """`(4, 4)` the sensor's pose now, habitat axes."""
+        return self._task.camera_to_world[0]
+
+    @property
+    def agent_pose(self) -> tuple[NDArray[np.float64], float, float]:
+        """The agent's feet, `(3,)` metres, and its yaw and pitch in radians."""
+        task = self._task
+        return task.position[0].copy(), float(task.yaw[0]), float(task.pitch[0])
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode at a random navigable point and heading.
+
+        Args:
+            seed: of the environment's random generator.
+            options: `position` (x, z or x, y, z in metres) and `yaw` (radians) place the agent instead.
+
+        Raises:
+            UsageError: the given position is not navigable.
+        """
+        super().reset(seed=seed)
+        options = options or {}
+        position = self.area.random_points(self.np_random, 1)
+        yaw = self.np_random.uniform(-np.pi, np.pi, size=1)
+        if options.get("position") is not None:
+            position = self._place(np.asarray(options["position"], dtype=np.float64))
+        if options.get("yaw") is not None:
+            yaw = np.array([float(options["yaw"])])
+        observation = self._task.reset([0], position, yaw)
+        self._running = True
+        return observation[0], {"coverage": 0.0, "views": 0}
+
+    def step(self, action: np.int64 | int) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Do one action and capture one view.
+
+        Raises:
+            UsageError: the action is not one of the six.
+            gymnasium.error.ResetNeeded: the episode has ended, or none was started.
+        """
+        if not self._running:
+            raise gymnasium.error.ResetNeeded("AVP-v0: call reset() before step(): no episode is running")
+        if not self.action_space.contains(np.int64(action)):
+            raise UsageError(f"action: expected 0 to {len(ACTION_NAMES) - 1}, got {action!r}")
+        outcome = self._task.step(np.array([action]))
+        info = step_info(self._task, outcome, 0)
+        terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
+        self._running = not (terminated or truncated)
+        return outcome.observation[0], float(outcome.reward[0]), terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """The camera's picture beside the top-down map, `(h, w, 3)`; None without a render mode."""
+        if self.render_mode is None:
+            return None
+        from avp_habitat.drawing import beside, draw_trajectory
+
+        camera = Intrinsics.from_hfov(*_PICTURE, hfov_deg=self.settings.hfov_deg)
+        picture = self.capture(self._task.camera_to_world, camera).rgb
+        assert picture is not None
+        return beside(picture[0], draw_trajectory(self.area, self._task.trajectory(0)))
+
+    def capture(self, camera_to_world: NDArray[np.floating], intrinsics: Intrinsics) -> Frames:
+        """Pictures and depth of `(n, 4, 4)` habitat poses, without any effect on the episode."""
+        return self.simulator.render(camera_to_world, intrinsics, rgb=True)
+
+    def close(self) -> None:
+        """End the episode; the simulator is shared and goes with its last user."""
+        self._running = False
+
+    def _place(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+        if position.shape not in ((2,), (3,)) or not np.isfinite(position).all():
+            raise UsageError(f"position: expected x, z or x, y, z in metres, got {position.tolist()}")
+        point = np.array([[position[0], 0.0, position[-1]]])
+        if not self.area.contains(point)[0]:
+            raise UsageError(f"position: {position.tolist()} is not navigable in {self.scene_name}")
+        point[:, 1] = self.area.floor_height(point)
+        return point
+
+
+def step_info(task: ViewpointTask, outcome: StepOutcome, row: int) -> dict[str, Any]:
+    """`info` of one agent's step, with the episode's figures and trajectory when it ends there."""
+    facts = outcome.facts
+    info: dict[str, Any] = {
+        "coverage": float(facts.coverage[row]),
+        "new_cells": int(facts.new_cells[row]),
+        "views": int(task.steps[row]),
+        "collided": bool(facts.collided[row]),
+        "redundant": bool(facts.redundant[row]),
+        "reward_parts": {name: float(values[row]) for name, values in outcome.parts.items()},
+    }
+    if outcome.terminated[row] or outcome.truncated[row]:
+        stopped = bool(outcome.terminated[row])
+        trajectory = task.trajectory(row)
+        info["avp_episode"] = episode_metrics(trajectory, stopped=stopped)
+        info["avp_trajectory"] = trajectory
+        info["is_success"] = stopped
+    return info
+
+
+def _with_overrides(settings: TaskSettings, overrides: dict[str, Any]) -> TaskSettings:
+    for name in overrides:
+        if name not in TaskSettings.__dataclass_fields__:
+            raise unknown_name("AVP-v0 option", name, ["scene", "simulator", *TaskSettings.__dataclass_fields__])
+    return replace(settings, **overrides)

@@ -1,0 +1,149 @@
+"""The three rewards of the task as sums of named parts, for n agents at a time."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.errors import unknown_name
+
+Float = NDArray[np.floating]
+Bool = NDArray[np.bool_]
+
+PARTS = ("coverage", "spread", "step", "collision", "redundancy", "stop")
+"""Names of the parts; every reward returns all of them, zero where it has no such term."""
+
+
+@dataclass(frozen=True)
+class RewardConstants:
+    """The constants of all rewards; the paper gives none, so these are ours and the same for every scene."""
+
+    alpha: float = 0.02
+    """α of `coverage` and `coverage_redundancy`: reward per newly observed cell (0.01 m²)."""
+    alpha_proposed: float = 0.1
+    """α of `proposed`: reward per (newly observed cell)^β."""
+    beta: float = 0.5
+    """β of `proposed`, no unit, below 1: many new cells at once count less than the same cells one after another."""
+    visit_decay: float = 0.5
+    """Weight of earlier visits v in α / (1 + 0.5·v), per visit."""
+    spread: float = 0.02
+    """λ_s: reward per metre between the agent and the mean of the positions it visited."""
+    spread_limit_m: float = 3.0
+    """r_max in metres: more distance than this earns nothing more."""
+    step: float = 0.05
+    """P_step: cost of each step."""
+    collision: float = 0.2
+    """P_collision: cost of a forward move that was blocked."""
+    redundancy: float = 0.1
+    """P_redundancy: cost of a view like an earlier one."""
+    redundancy_distance_m: float = 0.2
+    """d_red in metres: below one forward move, so that walking on is never redundant."""
+    redundancy_angle_deg: float = 5.0
+    """δ in degrees, for yaw and pitch alike: below one turn, so that turning on is never redundant."""
+    stop_bonus: float = 2.0
+    """B_s: reward of stopping with enough coverage."""
+    stop_per_step_left: float = 0.05
+    """λ_e: further reward per step of the budget that was not used."""
+    early_stop: float = 0.2
+    """Cost of choosing stop with too little coverage."""
+    stop_coverage: float = 0.85
+    """τ: the coverage from which stop ends the episode, within [0, 1]."""
+
+
+@dataclass(frozen=True)
+class StepFacts:
+    """What happened to n agents in one step; every array is `(n,)`."""
+
+    new_cells: Float
+    """Δc: navigable cells first observed by this step's view."""
+    earlier_visits: Float
+    """v: earlier views taken from the agent's cell."""
+    spread_m: Float
+    """‖p − p̄‖ in metres on the floor plane; p̄ is the mean of the positions visited so far."""
+    collided: Bool
+    """Forward was chosen and the agent moved less than 0.05 m."""
+    redundant: Bool
+    """An earlier view lies within d_red and both its angles within δ."""
+    stop_chosen: Bool
+    """The stop action was chosen, and this reward has one."""
+    coverage: Float
+    """C after the step."""
+    steps_left: Float
+    """T − t after the step."""
+
+
+def _coverage(facts: StepFacts, constants: RewardConstants) -> dict[str, Float]:
+    """Eq. 24: α·Δc − P_collision."""
+    return {"coverage": constants.alpha * facts.new_cells, "collision": -constants.collision * facts.collided}
+
+
+def _coverage_redundancy(facts: StepFacts, constants: RewardConstants) -> dict[str, Float]:
+    """Eq. 25: α·Δc + λ_s·min(‖p − p̄‖, r_max) − P_redundancy − P_collision."""
+    return _coverage(facts, constants) | _dispersion(facts, constants)
+
+
+def _proposed(facts: StepFacts, constants: RewardConstants) -> dict[str, Float]:
+    """Eq. 19–22: sublinear, visit-discounted coverage with dispersion, step cost and a learned stop."""
+    discount = constants.alpha_proposed / (1 + constants.visit_decay * facts.earlier_visits)
+    success = constants.stop_bonus + constants.stop_per_step_left * facts.steps_left
+    stop = np.where(stops_episode(facts, constants), success, -constants.early_stop)
+    return _dispersion(facts, constants) | {
+        "coverage": discount * np.power(facts.new_cells, constants.beta),
+        "step": np.full(len(facts.coverage), -constants.step),
+        "collision": -constants.collision * facts.collided,
+        "stop": np.where(facts.stop_chosen, stop, 0.0),
+    }
+
+
+def _dispersion(facts: StepFacts, constants: RewardConstants) -> dict[str, Float]:
+    return {
+        "spread": constants.spread * np.minimum(facts.spread_m, constants.spread_limit_m),
+        "redundancy": -constants.redundancy * facts.redundant,
+    }
+
+
+_REWARDS: dict[str, Callable[[StepFacts, RewardConstants], dict[str, Float]]] = {
+    "coverage": _coverage,
+    "coverage_redundancy": _coverage_redundancy,
+    "proposed": _proposed,
+}
+REWARD_NAMES = tuple(_REWARDS)
+_WITH_STOP = frozenset({"proposed"})
+
+
+def check_reward(name: str) -> str:
+    """The name itself when it is a reward's.
+
+    Raises:
+        UsageError: it is not; the text names the nearest one.
+    """
+    if name not in _REWARDS:
+        raise unknown_name("reward", name, REWARD_NAMES)
+    return name
+
+
+def has_stop(name: str) -> bool:
+    """Whether the stop action is available under this reward; elsewhere it is "no movement"."""
+    return name in _WITH_STOP
+
+
+def stops_episode(facts: StepFacts, constants: RewardConstants) -> Bool:
+    """`(n,)` whether stop was chosen with C ≥ τ, which ends the episode."""
+    return facts.stop_chosen & (facts.coverage >= constants.stop_coverage)
+
+
+def reward_parts(name: str, facts: StepFacts, constants: RewardConstants) -> dict[str, Float]:
+    """The parts of a reward, `(n,)` each, in the order of `PARTS`; the reward is their sum.
+
+    Args:
+        name: one of `REWARD_NAMES`.
+        facts: of one step of n agents.
+        constants: of all rewards.
+
+    Raises:
+        UsageError: no such reward.
+    """
+    parts = _REWARDS[check_reward(name)](facts, constants)
+    zero = np.zeros(len(facts.coverage))
+    return {part: np.asarray(parts.get(part, zero), dtype=np.float64) for part in PARTS}
