@@ -6,7 +6,7 @@ import platform
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -48,7 +48,7 @@ class Request:
     """Of the start and of policies that draw at random."""
     simulator: str = "raycast"
     """The simulator's name."""
-    camera: Intrinsics = Intrinsics.from_hfov(640, 480, hfov_deg=90.0)
+    camera: Intrinsics = field(default_factory=lambda: Intrinsics.from_hfov(640, 480, hfov_deg=90.0))
     """Of the pictures that are written."""
     stochastic: bool = False
     """Sample a model's actions instead of taking the likeliest."""

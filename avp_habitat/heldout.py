@@ -39,7 +39,7 @@ def heldout_poses(simulator: Simulator, *, sensor_height_m: float, views: int = 
     camera = Intrinsics.from_hfov(32, 24, hfov_deg=90.0)
     found: list[NDArray[np.float64]] = []
     for _ in range(_TRIES):
-        position = simulator.area.random_points(rng, 1) + [0.0, sensor_height_m, 0.0]
+        position = simulator.area.random_points(rng, 1) + np.array([0.0, sensor_height_m, 0.0])
         yaw, pitch = rng.uniform(-np.pi, np.pi, 1), np.radians(rng.uniform(-PITCH_DEG, PITCH_DEG, 1))
         pose = poses.camera_to_world(position, yaw=yaw, pitch=pitch)
         if simulator.render(pose, camera, rgb=False).depth.mean() >= MIN_MEAN_DEPTH_M:

@@ -94,9 +94,10 @@ def read_meta(folder: Path) -> dict[str, Any]:
     if meta.get("format") != FORMAT:
         raise RolloutError(f"{path}: expected format {FORMAT!r}, found {meta.get('format')!r}")
     if meta.get("format_version") != FORMAT_VERSION:
+        writer = _of(meta, "versions").get("avp-suite", "of unknown version")
         raise RolloutError(
             f"{path}: expected format version {FORMAT_VERSION}, found {meta.get('format_version')!r}, written by "
-            f"avp-suite {_of(meta, 'versions').get('avp-suite', 'of unknown version')}; collect it again or use that version"
+            f"avp-suite {writer}; collect it again or read it with that version"
         )
     return meta
 
@@ -190,9 +191,7 @@ def _check_listing(root: Path, folder: Path, suffix: str, count: int) -> None:
         with os.scandir(folder) as entries:
             found = {entry.name: entry.is_symlink() for entry in entries}
     except OSError as error:
-        raise RolloutError(
-            f"{folder}: expected a folder of {count} files, could not list it: {error.strerror}"
-        ) from None
+        raise RolloutError(f"{folder}: expected {count} files, could not list it: {error.strerror}") from None
     expected = {frame_name(index) + suffix for index in range(count)}
     if missing := sorted(expected - found.keys()):
         raise RolloutError(f"{folder / missing[0]}: expected this file ({count} frames by rollout.json), found none")
