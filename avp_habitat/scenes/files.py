@@ -1,0 +1,82 @@
+"""The files that a scene consists of: confined to its folder and remembered for its digest."""
+
+import hashlib
+import io
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.errors import SceneError
+
+
+class SceneFiles:
+    """Reads a scene's file and the files it refers to, none of which may lie outside the scene's folder."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the scene stored at `path`.
+
+        Raises:
+            SceneError: the file cannot be read, or has no byte.
+        """
+        self.path = path
+        self._folder = path.parent.resolve()
+        self._referenced: dict[str, bytes] = {}
+        self.main = self._read(path)
+        if not self.main:
+            raise SceneError(f"{path}: the file is empty")
+
+    def read(self, uri: str) -> bytes:
+        """Content of a referenced file.
+
+        Args:
+            uri: relative path, percent-encoded or not.
+
+        Raises:
+            SceneError: the file is missing or lies outside the scene's folder.
+        """
+        name = unquote(uri).replace("\\", "/")
+        target = (self._folder / name).resolve()
+        if not target.is_relative_to(self._folder):
+            raise SceneError(f"{self.path}: refers to {uri!r}, which lies outside the folder of the scene")
+        if name not in self._referenced:
+            self._referenced[name] = self._read(target)
+        return self._referenced[name]
+
+    def digest(self) -> str:
+        """Hexadecimal SHA-256 of the scene's file followed by the files read so far, in order of their names."""
+        content = hashlib.sha256(self.main)
+        for name in sorted(self._referenced):
+            content.update(self._referenced[name])
+        return content.hexdigest()
+
+    def _read(self, path: Path) -> bytes:
+        try:
+            return path.read_bytes()
+        except OSError as error:
+            owner = "" if path == self.path else f" (referred to by {self.path.name})"
+            raise SceneError(f"{path}{owner}: cannot be read: {error.strerror}") from error
+
+
+def decode_picture(content: bytes, name: str) -> NDArray[np.uint8]:
+    """Pixels, `(height, width, 3)` uint8 as stored (sRGB), of an encoded picture; transparency is dropped.
+
+    Args:
+        content: an encoded PNG, JPEG or other format that Pillow reads.
+        name: what to call the picture in an error.
+
+    Raises:
+        SceneError: the bytes are no picture.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(content)) as image:
+            if image.mode.startswith("I"):
+                # Pillow clips 16-bit greys to 255 when it converts them, instead of scaling them.
+                grey = (np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8)
+                return np.repeat(grey[..., None], 3, axis=2)
+            return np.ascontiguousarray(image.convert("RGB"))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise SceneError(f"{name}: the picture cannot be decoded: {error}") from error

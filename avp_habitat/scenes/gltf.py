@@ -1,0 +1,247 @@
+"""Reads glTF 2.0 (`.glb`, `.gltf`) into one TexturedMesh."""
+
+import json
+import math
+import struct
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pygltflib
+from numpy.typing import NDArray
+
+from avp_habitat.errors import SceneError
+from avp_habitat.scenes.files import SceneFiles, decode_picture
+from avp_habitat.scenes.gltf_buffers import Buffers
+from avp_habitat.scenes.mesh import TexturedMesh, merge
+
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_SUPPORTED = {
+    "EXT_texture_webp",
+    "KHR_lights_punctual",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_unlit",
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
+}
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """What a material says about colour."""
+
+    factor: NDArray[np.float32]
+    """`(3,)` base-colour factor."""
+    texture: NDArray[np.uint8] | None
+    """Base-colour picture."""
+    coordinates: str
+    """Name of the attribute that holds the texture coordinates."""
+    transform: NDArray[np.float32]
+    """`(2, 3)` affine map of the texture coordinates."""
+
+
+def read_gltf(files: SceneFiles) -> TexturedMesh:
+    """The triangles of a document's default scene in the world frame; points and lines have no surface.
+
+    Args:
+        files: the `.glb` or `.gltf` file and its folder.
+
+    Raises:
+        SceneError: the file is damaged, holds no triangle, or requires an extension that is not supported.
+    """
+    try:
+        return _Reader(files).mesh()
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError, OSError, RecursionError, struct.error) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise SceneError(f"{files.path}: expected a valid glTF 2.0 file, but it is damaged: {reason}") from error
+
+
+class _Reader:
+    """One document on its way to a mesh."""
+
+    def __init__(self, files: SceneFiles) -> None:
+        self._path = files.path
+        self._document = _parse(files.main)
+        self._buffers = Buffers(self._document, files)
+        self._pictures: dict[int, NDArray[np.uint8]] = {}
+        unsupported = sorted(set(self._document.extensionsRequired or []) - _SUPPORTED)
+        if unsupported:
+            raise SceneError(
+                f"{files.path}: requires the glTF extension {', '.join(unsupported)}, which is not supported; "
+                "export the scene without it (uncompressed geometry, PNG or JPEG textures)"
+            )
+
+    def mesh(self) -> TexturedMesh:
+        """All triangles of the default scene, placed in the world."""
+        parts = [
+            part
+            for mesh, to_world in self._placed_meshes()
+            for primitive in self._document.meshes[mesh].primitives
+            if (part := self._primitive(primitive, to_world)) is not None
+        ]
+        if not parts:
+            raise SceneError(f"{self._path}: expected a mesh with triangles, found none in the default scene")
+        return merge(parts)
+
+    def _roots(self) -> list[int]:
+        document = self._document
+        if document.scenes:
+            return document.scenes[document.scene or 0].nodes or []
+        children = {child for node in document.nodes for child in node.children or []}
+        return [index for index in range(len(document.nodes)) if index not in children]
+
+    def _placed_meshes(self) -> Iterator[tuple[int, NDArray]]:
+        """Mesh indices with their `(4, 4)` transforms to the world, in document order."""
+        waiting = [(root, np.eye(4)) for root in reversed(self._roots())]
+        seen: set[int] = set()
+        while waiting:
+            index, parent = waiting.pop()
+            if index in seen:
+                raise SceneError(f"{self._path}: node {index} has two parents; expected a tree of nodes")
+            seen.add(index)
+            node = self._document.nodes[index]
+            to_world = parent @ _local_transform(node)
+            if node.mesh is not None:
+                yield node.mesh, to_world
+            waiting += [(child, to_world) for child in reversed(node.children or [])]
+
+    def _primitive(self, primitive: pygltflib.Primitive, to_world: NDArray) -> TexturedMesh | None:
+        mode = _TRIANGLES if primitive.mode is None else primitive.mode
+        attributes = primitive.attributes
+        if mode not in (_TRIANGLES, _STRIP, _FAN) or attributes.POSITION is None:
+            return None
+        if "KHR_draco_mesh_compression" in (primitive.extensions or {}) and not self._has_data(attributes.POSITION):
+            raise SceneError(f"{self._path}: uses KHR_draco_mesh_compression, which is not supported")
+        local = self._buffers.array(attributes.POSITION).astype(np.float64)
+        vertices = (local @ to_world[:3, :3].T + to_world[:3, 3]).astype(np.float32)
+        surface = self._surface(primitive.material)
+        triangles = self._triangles(primitive.indices, mode, len(vertices))
+        uv = self._coordinates(attributes, surface, len(vertices))
+        textured = surface.texture is not None and uv is not None
+        return TexturedMesh(
+            vertices,
+            triangles,
+            np.zeros((len(vertices), 2), np.float32) if uv is None else uv,
+            self._colours(attributes, surface, len(vertices)),
+            np.full(len(triangles), 0 if textured else -1, np.int32),
+            [surface.texture] if textured and surface.texture is not None else [],
+        )
+
+    def _has_data(self, accessor: int) -> bool:
+        return self._document.accessors[accessor].bufferView is not None
+
+    def _triangles(self, accessor: int | None, mode: int, vertices: int) -> NDArray[np.int32]:
+        if accessor is None:
+            corners = np.arange(vertices, dtype=np.int64)
+        else:
+            corners = self._buffers.array(accessor).reshape(-1).astype(np.int64)
+        if len(corners) and corners.max() >= vertices:
+            raise SceneError(f"{self._path}: a triangle names vertex {corners.max()} of {vertices}")
+        return _corners_to_triangles(corners, mode).astype(np.int32)
+
+    def _coordinates(self, attributes: Any, surface: _Surface, vertices: int) -> NDArray[np.float32] | None:
+        accessor = getattr(attributes, surface.coordinates, None)
+        if accessor is None:
+            return None
+        uv = self._matching(accessor, surface.coordinates, vertices)[:, :2].astype(np.float32)
+        return uv @ surface.transform[:, :2].T + surface.transform[:, 2]
+
+    def _colours(self, attributes: Any, surface: _Surface, vertices: int) -> NDArray[np.float32]:
+        colours = np.broadcast_to(surface.factor, (vertices, 3))
+        if attributes.COLOR_0 is not None:
+            colours = self._matching(attributes.COLOR_0, "COLOR_0", vertices)[:, :3] * colours
+        return np.clip(colours, 0, 1).astype(np.float32)
+
+    def _matching(self, accessor: int, name: str, vertices: int) -> NDArray:
+        values = self._buffers.array(accessor)
+        if len(values) != vertices:
+            raise SceneError(f"{self._path}: expected {vertices} values of {name}, one for each vertex; got {len(values)}")
+        return values
+
+    def _surface(self, index: int | None) -> _Surface:
+        material = None if index is None else self._document.materials[index]
+        shading = material.pbrMetallicRoughness if material else None
+        factor = (shading.baseColorFactor if shading else None) or [1.0, 1.0, 1.0]
+        info = shading.baseColorTexture if shading else None
+        if info is None or info.index is None:
+            return _Surface(np.array(factor[:3], np.float32), None, "TEXCOORD_0", np.eye(2, 3, dtype=np.float32))
+        moved = (info.extensions or {}).get("KHR_texture_transform", {})
+        channel = moved.get("texCoord", info.texCoord or 0)
+        return _Surface(
+            np.array(factor[:3], np.float32), self._picture(info.index), f"TEXCOORD_{channel}", _uv_transform(moved)
+        )
+
+    def _picture(self, texture: int) -> NDArray[np.uint8]:
+        entry = self._document.textures[texture]
+        index = (entry.extensions or {}).get("EXT_texture_webp", {}).get("source", entry.source)
+        if index is None:
+            names = ", ".join(entry.extensions or {}) or "no picture"
+            raise SceneError(f"{self._path}: texture {texture} has {names}; expected a PNG, JPEG or WebP picture")
+        if index not in self._pictures:
+            image = self._document.images[index]
+            content = self._buffers.resolve(image.uri) if image.uri else bytes(self._buffers.view(image.bufferView))
+            self._pictures[index] = decode_picture(content, f"{self._path}: image {index}")
+        return self._pictures[index]
+
+
+def _parse(content: bytes) -> pygltflib.GLTF2:
+    """The document, without its binary chunk being copied into objects."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if content[:4] == b"glTF":
+            declared = struct.unpack_from("<I", content, 8)[0]
+            if declared > len(content):
+                raise ValueError(f"truncated: the header announces {declared} bytes, found {len(content)}")
+            return pygltflib.GLTF2.load_from_bytes(content)
+        json.loads(content.decode("utf-8"))
+        return pygltflib.GLTF2.gltf_from_json(content.decode("utf-8"))
+
+
+def _local_transform(node: pygltflib.Node) -> NDArray:
+    """`(4, 4)` node to parent: the node's matrix (stored by columns), or translation x rotation x scale."""
+    if node.matrix:
+        return np.array(node.matrix, np.float64).reshape(4, 4).T
+    transform = np.eye(4)
+    if node.rotation:
+        transform[:3, :3] = _rotation(np.array(node.rotation, np.float64))
+    if node.scale:
+        transform[:3, :3] *= np.array(node.scale, np.float64)
+    if node.translation:
+        transform[:3, 3] = node.translation
+    return transform
+
+
+def _rotation(quaternion: NDArray) -> NDArray:
+    """`(3, 3)` rotation of a quaternion (x, y, z, w), which need not have unit length."""
+    length = np.linalg.norm(quaternion)
+    if not length > 0:
+        raise ValueError("a node's rotation is the zero quaternion")
+    x, y, z, w = quaternion / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _corners_to_triangles(corners: NDArray, mode: int) -> NDArray:
+    """`(t, 3)` of `(n,)` vertex indices in a list, strip or fan."""
+    if mode == _TRIANGLES:
+        return corners[: len(corners) // 3 * 3].reshape(-1, 3)
+    first = corners[:-2] if mode == _STRIP else np.broadcast_to(corners[:1], max(len(corners) - 2, 0))
+    triangles = np.stack([first, corners[1:-1], corners[2:]], axis=1)
+    if mode == _STRIP:
+        triangles[1::2] = triangles[1::2][:, [1, 0, 2]]
+    return triangles
+
+
+def _uv_transform(entry: dict[str, Any]) -> NDArray[np.float32]:
+    """`(2, 3)` affine map of KHR_texture_transform: scale, then rotate (counter-clockwise as seen), then shift."""
+    angle = float(entry.get("rotation", 0.0))
+    scale, offset = entry.get("scale", [1.0, 1.0]), entry.get("offset", [0.0, 0.0])
+    rotation = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+    return np.column_stack([rotation * np.array(scale), offset]).astype(np.float32)

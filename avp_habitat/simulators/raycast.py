@@ -1,0 +1,189 @@
+"""The embedded simulator: Embree ray casting, through Open3D, on the CPU."""
+
+from functools import cached_property, lru_cache
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.poses import Intrinsics, pixel_directions
+from avp_habitat.simulators.base import Frames
+
+if TYPE_CHECKING:
+    from avp_habitat.navigation.area import NavigableArea
+    from avp_habitat.scenes.loader import Scene
+    from avp_habitat.simulators.shading import Surface
+
+_RAYS_PER_CALL = 1 << 20
+
+
+class RaycastSimulator:
+    """A scene seen by casting rays; surfaces are unlit and seen from both sides.
+
+    Rendering is deterministic: the same poses give the same bytes on any number of threads.
+    """
+
+    name = "raycast"
+
+    def __init__(self, scene: "Scene") -> None:
+        """Build the ray-tracing structure of `scene` (about a second per million triangles)."""
+        self.scene = scene.name
+        self.scene_digest = scene.digest
+        self.version = f"open3d {metadata.version('open3d')}"
+        self._mesh = scene.mesh
+        self._rays = _Rays(scene.mesh.vertices, scene.mesh.triangles)
+
+    @cached_property
+    def area(self) -> "NavigableArea":
+        """Where agents can stand; computed when first asked for.
+
+        Raises:
+            SceneError: the scene has no floor on which an agent can stand.
+        """
+        from avp_habitat.navigation.area import build_area
+
+        return build_area(self._mesh, self.surface_below)
+
+    @cached_property
+    def _surface(self) -> "Surface":
+        from avp_habitat.simulators.shading import pack_surface
+
+        return pack_surface(self._mesh)
+
+    def render(self, camera_to_world: NDArray[np.floating], intrinsics: Intrinsics, *, rgb: bool) -> Frames:
+        """Depth, and colour when asked for.
+
+        Args:
+            camera_to_world: `(n, 4, 4)` habitat poses.
+            intrinsics: of all n cameras.
+            rgb: whether to compute colours, which costs more than depth alone.
+
+        Returns:
+            n frames; where a ray leaves the scene, depth is 0.0 and colour black.
+        """
+        poses = np.asarray(camera_to_world, dtype=np.float64)
+        shape = (len(poses), intrinsics.height, intrinsics.width)
+        depth = np.empty(shape, np.float32)
+        colour = np.empty((*shape, 3), np.uint8) if rgb else None
+        count = max(1, _RAYS_PER_CALL // (intrinsics.height * intrinsics.width))
+        for start in range(0, len(poses), count):
+            chunk = slice(start, start + count)
+            rays = _camera_rays(poses[chunk], intrinsics)
+            hits = self._rays.cast(rays)
+            distance = hits["t_hit"]
+            depth[chunk] = np.where(np.isfinite(distance), distance, 0).reshape(depth[chunk].shape)
+            if colour is not None:
+                colour[chunk] = self._shade(poses[chunk], intrinsics, rays, hits).reshape(colour[chunk].shape)
+        return Frames(colour, depth)
+
+    def _shade(
+        self, poses: NDArray[np.floating], intrinsics: Intrinsics, rays: NDArray[np.float32], hits: dict[str, NDArray]
+    ) -> NDArray[np.uint8]:
+        from avp_habitat.simulators.shading import Hits, shade
+
+        # Directions are linear in the pixel coordinates, so their differences are the same all over the image.
+        corner = pixel_directions(Intrinsics(2, 2, intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
+        right, down = corner[0, 1] - corner[0, 0], corner[1, 0] - corner[0, 0]
+        rotation = poses[:, :3, :3]
+        return shade(
+            self._surface,
+            Hits(
+                rays[..., 3:],
+                hits["t_hit"],
+                hits["primitive_ids"],
+                hits["primitive_uvs"],
+                np.ascontiguousarray(rotation @ right),
+                np.ascontiguousarray(rotation @ down),
+            ),
+        )
+
+    def visible(
+        self,
+        camera_to_world: NDArray[np.floating],
+        points: NDArray[np.floating],
+        pairs: NDArray[np.integer],
+        *,
+        tolerance_m: float,
+    ) -> NDArray[np.bool_]:
+        """Whether camera rays reach points.
+
+        Args:
+            camera_to_world: `(n, 4, 4)` habitat poses.
+            points: `(m, 3)` metres, world frame.
+            pairs: `(k, 2)` rows (camera, point); the points are inside those cameras' images.
+            tolerance_m: a hit this close before the point still reaches it, in metres along the ray.
+
+        Returns:
+            `(k,)`; a point nearer than the tolerance is always reached.
+        """
+        origin = np.asarray(camera_to_world, dtype=np.float64)[pairs[:, 0], :3, 3]
+        offset = np.asarray(points, dtype=np.float64)[pairs[:, 1]] - origin
+        distance = np.sqrt((offset * offset).sum(axis=1))
+        far = distance > tolerance_m
+        # A ray's direction ends where its occlusion no longer counts, so that one limit, t <= 1, fits all rays.
+        share = 1.0 - tolerance_m / distance[far]
+        rays = np.concatenate([origin[far], offset[far] * share[:, None]], axis=1).astype(np.float32)
+        reached = np.ones(len(pairs), dtype=bool)
+        reached[far] = ~self._rays.blocked(rays)
+        return reached
+
+    def surface_below(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Height of the first surface straight below each point.
+
+        Args:
+            points: `(n, 3)` metres, world frame.
+
+        Returns:
+            `(n,)` y in metres, NaN where there is nothing below.
+        """
+        points = np.asarray(points, dtype=np.float64)
+        rays = np.concatenate([points, np.broadcast_to([0.0, -1.0, 0.0], points.shape)], axis=1).astype(np.float32)
+        distance = self._rays.cast(rays)["t_hit"].astype(np.float64)
+        return np.where(np.isfinite(distance), points[:, 1] - distance, np.nan)
+
+    def close(self) -> None:
+        """Free nothing: the memory goes with the object."""
+
+
+@lru_cache(maxsize=8)
+def _pixel_columns(intrinsics: Intrinsics) -> NDArray[np.float64]:
+    """`(3, pixels)` camera-frame directions, one contiguous row per axis."""
+    return np.ascontiguousarray(pixel_directions(intrinsics).reshape(-1, 3).T)
+
+
+def _camera_rays(poses: NDArray[np.floating], intrinsics: Intrinsics) -> NDArray[np.float32]:
+    """`(n, pixels, 6)` origins and directions, world frame.
+
+    Written out as sums instead of a matrix product: BLAS may add in another order on another number of threads.
+    """
+    x, y, z = _pixel_columns(intrinsics)
+    rays = np.empty((len(poses), len(x), 6), np.float32)
+    rays[..., :3] = poses[:, None, :3, 3]
+    for axis in range(3):
+        row = poses[:, axis, :3, None]
+        rays[..., 3 + axis] = row[:, 0] * x + row[:, 1] * y + row[:, 2] * z
+    return rays
+
+
+class _Rays:
+    """Open3D's ray-casting scene with numpy arrays going in and out."""
+
+    def __init__(self, vertices: NDArray[np.float32], triangles: NDArray[np.int32]) -> None:
+        import open3d
+
+        self._tensor = open3d.core.Tensor.from_numpy
+        self._scene: Any = open3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            self._tensor(np.ascontiguousarray(vertices, np.float32)),
+            self._tensor(np.ascontiguousarray(triangles, np.uint32)),
+        )
+
+    def cast(self, rays: NDArray[np.float32]) -> dict[str, NDArray]:
+        """First hits of `(..., 6)` rays: `t_hit` (inf for none), `primitive_ids`, `primitive_uvs`."""
+        hits = self._scene.cast_rays(self._tensor(rays))
+        return {key: hits[key].numpy() for key in ("t_hit", "primitive_ids", "primitive_uvs")}
+
+    def blocked(self, rays: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Whether `(n, 6)` rays hit anything at t <= 1."""
+        return self._scene.test_occlusions(self._tensor(rays), tnear=0.0, tfar=1.0).numpy()
