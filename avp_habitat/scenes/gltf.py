@@ -18,6 +18,8 @@ from avp_habitat.scenes.gltf_buffers import Buffers
 from avp_habitat.scenes.mesh import TexturedMesh, merge
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+# What walking through a document raises where a field is missing, of another type or out of range.
+_MALFORMED = (AttributeError, IndexError, KeyError, TypeError, ValueError, OSError, RecursionError, struct.error)
 _SUPPORTED = {
     "EXT_texture_webp",
     "KHR_lights_punctual",
@@ -53,7 +55,7 @@ def read_gltf(files: SceneFiles) -> TexturedMesh:
     """
     try:
         return _Reader(files).mesh()
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError, OSError, RecursionError, struct.error) as error:
+    except _MALFORMED as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise SceneError(f"{files.path}: expected a valid glTF 2.0 file, but it is damaged: {reason}") from error
 
@@ -66,6 +68,9 @@ class _Reader:
         self._document = _parse(files.main)
         self._buffers = Buffers(self._document, files)
         self._pictures: dict[int, NDArray[np.uint8]] = {}
+        version = str(self._document.asset.version)
+        if not version.startswith("2."):
+            raise SceneError(f"{files.path}: expected glTF 2.0, got version {version}")
         unsupported = sorted(set(self._document.extensionsRequired or []) - _SUPPORTED)
         if unsupported:
             raise SceneError(
@@ -157,7 +162,9 @@ class _Reader:
     def _matching(self, accessor: int, name: str, vertices: int) -> NDArray:
         values = self._buffers.array(accessor)
         if len(values) != vertices:
-            raise SceneError(f"{self._path}: expected {vertices} values of {name}, one for each vertex; got {len(values)}")
+            raise SceneError(
+                f"{self._path}: expected {vertices} values of {name}, one for each vertex; got {len(values)}"
+            )
         return values
 
     def _surface(self, index: int | None) -> _Surface:
