@@ -1,0 +1,23 @@
+"""Callbacks of the suite for Stable-Baselines3, imported when they are first named."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from avp_sb3.metrics_callback import MetricsCallback
+    from avp_sb3.mlflow_callback import MLflowCallback
+    from avp_sb3.rerun_callback import RerunCallback
+
+__all__ = ["MLflowCallback", "MetricsCallback", "RerunCallback"]
+
+_HOME = {
+    "MetricsCallback": "avp_sb3.metrics_callback",
+    "MLflowCallback": "avp_sb3.mlflow_callback",
+    "RerunCallback": "avp_sb3.rerun_callback",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), name)

@@ -1,0 +1,103 @@
+"""The task's figures, averaged over the last episodes, in Stable-Baselines3's logger."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+
+from avp_habitat.metrics import coverage_per_view
+from avp_sb3.finished_episodes import finished_episodes, required
+
+MEANS = {
+    "coverage": "avp/coverage",
+    "views": "avp/views",
+    "annd_m": "avp/annd_m",
+    "ei": "avp/ei",
+    "stopped": "avp/stop_share",
+    "collisions": "avp/collisions",
+    "redundant_views": "avp/redundant_views",
+}
+"""Keys of `info["avp_episode"]`, and the names under which their means are recorded."""
+_RETURN = "return_"
+
+
+class EpisodeWindow:
+    """The figures of the last episodes, as rows of one array."""
+
+    def __init__(self, size: int) -> None:
+        """Make an empty window of at most `size` episodes."""
+        if size < 1:
+            raise ValueError(f"expected a window of at least 1 episode, got {size}")
+        self._size = size
+        self._keys: list[str] = []
+        self._rows = np.empty((0, 0))
+        self._added = 0
+
+    def add(self, episode: Mapping[str, float]) -> None:
+        """Take in an episode, in place of the oldest one when the window is full.
+
+        Args:
+            episode: `info["avp_episode"]`.
+
+        Raises:
+            MissingInfoError: a key of `MEANS`, or the return of a reward part that earlier episodes had, is missing.
+        """
+        if not self._added:
+            self._keys = [*MEANS, *sorted(key for key in episode if key.startswith(_RETURN))]
+            self._rows = np.empty((self._size, len(self._keys)))
+        self._rows[self._added % self._size] = [
+            required(episode, key, reader="MetricsCallback", inside="info['avp_episode']") for key in self._keys
+        ]
+        self._added += 1
+
+    def means(self) -> dict[str, float]:
+        """Means over the window by the name to record, with CpV; empty before the first episode."""
+        if not self._added:
+            return {}
+        rows = self._rows[: self._added]
+        mean = dict(zip(self._keys, rows.mean(axis=0).tolist(), strict=True))
+        lengths = rows[:, self._keys.index("views")]
+        return (
+            {name: mean[key] for key, name in MEANS.items()}
+            | {f"reward/{key.removeprefix(_RETURN)}": mean[key] for key in self._keys if key.startswith(_RETURN)}
+            | {"avp/cpv": coverage_per_view(rows[:, self._keys.index("coverage")], lengths)}
+        )
+
+
+class MetricsCallback(BaseCallback):
+    """Records coverage, CpV, ANND, EI, views, stop share, collisions, redundancy and the return of each reward part.
+
+    They appear wherever SB3 logs (screen, CSV, TensorBoard, MLflow) as `avp/...` and `reward/...`, averaged over the
+    last `window` episodes like SB3's own `rollout/ep_rew_mean`.
+    """
+
+    def __init__(self, window: int = 100, verbose: int = 0) -> None:
+        """Set the window.
+
+        Args:
+            window: episodes to average over.
+            verbose: as in SB3.
+        """
+        super().__init__(verbose)
+        self._size = window
+        self._window = EpisodeWindow(window)
+
+    def _on_training_start(self) -> None:
+        if self.num_timesteps == 0:
+            self._window = EpisodeWindow(self._size)
+
+    def _on_step(self) -> bool:
+        finished = finished_episodes(self.locals)
+        for _, info in finished:
+            self._window.add(required(info, "avp_episode", reader="MetricsCallback"))
+        if finished:
+            self._record()
+        return True
+
+    def _on_rollout_end(self) -> None:
+        # A rollout in which no episode ended still shows the window, as SB3 does with its own.
+        self._record()
+
+    def _record(self) -> None:
+        for name, value in self._window.means().items():
+            self.logger.record(name, value)

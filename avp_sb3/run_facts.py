@@ -1,0 +1,106 @@
+"""What is worth knowing about a training before it starts: hyper-parameters, task settings, versions, git commit."""
+
+import dataclasses
+import inspect
+import platform
+import subprocess
+from collections.abc import Mapping
+from importlib import metadata
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+PACKAGES = ("avp-suite", "stable-baselines3", "torch", "gymnasium", "numpy", "open3d", "mlflow")
+_NOT_HYPERPARAMETERS = {"self", "env", "policy", "verbose", "tensorboard_log", "_init_setup_model"}
+
+
+def hyperparameters(model: BaseAlgorithm) -> dict[str, Any]:
+    """The arguments of the algorithm's constructor with the values in use, flat, plus `algo`, `policy`, `n_envs`.
+
+    A constant schedule is its number; a changing one reads `start -> end`.
+    """
+    facts: dict[str, Any] = {
+        "algo": type(model).__name__,
+        "policy": model.policy_class.__name__,
+        "n_envs": model.n_envs,
+        "total_timesteps": model._total_timesteps,
+    }
+    for name in inspect.signature(type(model).__init__).parameters:
+        if name not in _NOT_HYPERPARAMETERS and hasattr(model, name):
+            facts[name] = _plain(getattr(model, name))
+    return flat(facts)
+
+
+def task_settings(env: VecEnv) -> dict[str, Any]:
+    """`env.*`: the settings of the first environment (attribute `settings`, a dataclass), flat; its gymnasium id."""
+    facts: dict[str, Any] = {}
+    settings = env.get_attr("settings", 0)[0] if env.has_attr("settings") else None
+    if dataclasses.is_dataclass(settings) and not isinstance(settings, type):
+        facts |= dataclasses.asdict(settings)
+    spec = env.get_attr("spec", 0)[0] if env.has_attr("spec") else None
+    if spec is not None:
+        facts["id"] = spec.id
+    return flat({"env": facts})
+
+
+def scene_tags(env: VecEnv) -> dict[str, str]:
+    """Names and SHA-256 digests of the scenes of all environments, each once, where they have such attributes."""
+    tags = {}
+    for attribute, tag in (("scene_name", "avp.scene"), ("scene_digest", "avp.scene_digest")):
+        if env.has_attr(attribute):
+            tags[tag] = ", ".join(dict.fromkeys(map(str, env.get_attr(attribute))))
+    return tags
+
+
+def version_tags() -> dict[str, str]:
+    """`version.PACKAGE` of Python and the packages that shape a training; packages that are absent are left out."""
+    tags = {"version.python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            tags[f"version.{package}"] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return tags
+
+
+def git_commit() -> str | None:
+    """The commit checked out in the current folder; None outside a repository or without git."""
+    command = ["git", "rev-parse", "HEAD"]
+    try:
+        answer = subprocess.run(
+            command, capture_output=True, text=True, timeout=10, check=True, stdin=subprocess.DEVNULL
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return answer.stdout.strip()
+
+
+def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one, keys joined by dots."""
+    leaves: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            leaves |= flat(value, f"{prefix}{key}.")
+        else:
+            leaves[f"{prefix}{key}"] = value
+    return leaves
+
+
+def _plain(value: Any) -> Any:
+    """A value whose text says what it is, without memory addresses."""
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, type):
+        return value.__name__
+    if callable(value):
+        return _schedule(value)
+    return value
+
+
+def _schedule(schedule: Any) -> Any:
+    try:
+        start, end = float(schedule(1.0)), float(schedule(0.0))
+    except (TypeError, ValueError):
+        return getattr(schedule, "__name__", type(schedule).__name__)
+    return start if start == end else f"{start:g} -> {end:g}"
