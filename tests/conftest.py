@@ -1,0 +1,21 @@
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """Real scenes and weights that lie beside some checkouts, never inside the project."""
+    folder = ROOT.parent / "shared"
+    if not (folder / "scenes").is_dir():
+        pytest.skip(f"{folder.name}/scenes does not lie beside this checkout: real rooms are not part of the project")
+    return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quiet_threads() -> None:
+    """Subprocesses of tests share two cores with the tests."""
+    os.environ.setdefault("OMP_NUM_THREADS", "2")

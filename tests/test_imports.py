@@ -1,0 +1,101 @@
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+SUITE = ("avp_habitat", "avp_sb3", "avp_nerfstudio")
+MAY_IMPORT = {
+    "avp_habitat": {"avp_habitat"},
+    "avp_sb3": {"avp_sb3", "avp_habitat"},
+    "avp_nerfstudio": {"avp_nerfstudio", "avp_habitat"},
+}
+LIGHT = ("poses", "coverage", "metrics", "rewards", "rollout", "observation", "trajectory", "errors")
+ONE_FILE = {"habitat_sim": "simulators/habitat.py", "open3d": "simulators/raycast.py"}
+NOT_AT_IMPORT = ("torch", "open3d", "habitat_sim", "mlflow", "rerun", "numba", "stable_baselines3", "trimesh", "scipy")
+
+
+def imported(source, *, top_level_only=False):
+    """Names of the modules that a source text imports."""
+    tree = ast.parse(source)
+    nodes = tree.body if top_level_only else ast.walk(tree)
+    found = set()
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module)
+    return found
+
+
+def wrong_directions(package, sources):
+    """`(file, module)` of every import of another package of the suite that may not be imported from here."""
+    return [
+        (name, module)
+        for name, source in sources.items()
+        for module in sorted(imported(source))
+        if module.split(".")[0] in SUITE and module.split(".")[0] not in MAY_IMPORT[package]
+    ]
+
+
+def sources_of(package):
+    folder = ROOT / package
+    return {str(path.relative_to(folder)): path.read_text(encoding="utf-8") for path in folder.rglob("*.py")}
+
+
+@pytest.mark.parametrize("package", SUITE)
+def test_imports_between_the_packages_point_one_way(package):
+    sources = sources_of(package)
+    assert sources
+    assert wrong_directions(package, sources) == []
+
+
+@pytest.mark.parametrize(
+    ("package", "line"),
+    [
+        ("avp_habitat", "import avp_sb3"),
+        ("avp_habitat", "def late():\n    from avp_nerfstudio.dataparser import AVPDataParser"),
+        ("avp_sb3", "from avp_nerfstudio import scores"),
+        ("avp_nerfstudio", "import avp_sb3.vec_env as vec"),
+    ],
+)
+def test_a_wrong_import_would_be_found(package, line):
+    sources = {**sources_of(package), "new.py": line}
+    assert [name for name, _ in wrong_directions(package, sources)] == ["new.py"]
+
+
+@pytest.mark.parametrize("module", LIGHT)
+def test_light_modules_import_numpy_and_the_standard_library_only(module):
+    source = (ROOT / "avp_habitat" / f"{module}.py").read_text(encoding="utf-8")
+    names = {name.split(".")[0] for name in imported(source)}
+    assert names <= set(sys.stdlib_module_names) | {"numpy", "avp_habitat"}
+    inner = {name.split(".")[1] for name in imported(source) if name.startswith("avp_habitat.")}
+    assert inner <= set(LIGHT)
+
+
+@pytest.mark.parametrize("heavy", ONE_FILE)
+def test_each_engine_is_imported_in_one_file_of_the_simulators(heavy):
+    users = [
+        name
+        for name, source in sources_of("avp_habitat").items()
+        if any(module.split(".")[0] == heavy for module in imported(source))
+    ]
+    assert set(users) <= {ONE_FILE[heavy]}
+
+
+def test_nothing_that_reads_scenes_or_rollouts_can_load_a_pickle():
+    # policies.py names pickle's error because a Stable-Baselines3 model, which is the user's own program, may hold one.
+    readers = {name: text for name, text in sources_of("avp_habitat").items() if name != "policies.py"}
+    for name, source in readers.items():
+        names = {module.split(".")[0] for module in imported(source)}
+        assert not names & {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}, name
+        assert "allow_pickle" not in source, name
+
+
+def test_importing_avp_habitat_loads_nothing_heavy():
+    code = "import sys, avp_habitat; print(' '.join(sorted(sys.modules)))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert "gymnasium" in loaded
+    assert [name for name in NOT_AT_IMPORT if name in loaded] == []

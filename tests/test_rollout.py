@@ -1,0 +1,198 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from avp_habitat import images, poses
+from avp_habitat.errors import RolloutError, UsageError
+from avp_habitat.poses import Intrinsics
+from avp_habitat.rollout import read_rollout
+from avp_habitat.rollout_writer import RolloutWriter
+
+CAMERA = Intrinsics.from_hfov(12, 8, hfov_deg=75)
+FRAMES, HELDOUT = 3, 2
+
+
+def some_poses(count):
+    spread = np.arange(count)
+    position = np.stack([spread * 0.25, spread * 0 + 1.5, -spread], axis=1)
+    return poses.camera_to_world(position, yaw=spread * 0.3, pitch=spread * 0.1 - 0.2)
+
+
+def write(folder):
+    rng = np.random.default_rng(0)
+    with RolloutWriter(folder, CAMERA) as writer:
+        for k, pose in enumerate(some_poses(FRAMES)):
+            writer.add_frame(rng.integers(0, 255, (8, 12, 3), dtype=np.uint8), rng.uniform(0.5, 9, (8, 12)), pose)
+            writer.add_step({"step": k + 1, "action": "stop"})
+        for pose in some_poses(HELDOUT):
+            writer.add_heldout(rng.integers(0, 255, (8, 12, 3), dtype=np.uint8), rng.uniform(0.5, 9, (8, 12)), pose)
+        writer.publish({"seed": 3, "versions": {"avp-suite": "0.1.0"}, "camera": {"hfov_deg": 75}})
+    return folder
+
+
+@pytest.fixture
+def rollout(tmp_path):
+    return write(tmp_path / "r0")
+
+
+def test_a_rollout_reads_back_as_it_was_written(rollout):
+    found = read_rollout(rollout)
+    assert found.intrinsics == CAMERA
+    assert (len(found.frames), len(found.heldout)) == (FRAMES, HELDOUT)
+    for view, pose in zip(found.frames, some_poses(FRAMES), strict=True):
+        np.testing.assert_allclose(view.camera_to_world, pose, atol=1e-8)
+    rng = np.random.default_rng(0)
+    np.testing.assert_array_equal(
+        images.read_rgb(found.frames[0].image), rng.integers(0, 255, (8, 12, 3), dtype=np.uint8)
+    )
+    np.testing.assert_allclose(images.read_depth(found.frames[0].depth), rng.uniform(0.5, 9, (8, 12)), atol=0.0006)
+    assert found.meta["seed"] == 3
+    assert read_rollout(rollout / "rollout.json").folder == rollout
+
+
+def test_transforms_json_lists_every_view_once_with_its_split(rollout):
+    transforms = json.loads((rollout / "transforms.json").read_text())
+    names = [frame["file_path"] for frame in transforms["frames"]]
+    assert len(set(names)) == FRAMES + HELDOUT
+    assert transforms["train_filenames"] + transforms["val_filenames"] == names
+    assert all((rollout / name).is_file() for name in names)
+    assert all((rollout / frame["depth_file_path"]).is_file() for frame in transforms["frames"])
+
+
+def test_depth_is_kept_in_whole_millimetres_and_never_wraps():
+    stored = images.encode_depth(np.array([0.0, 0.0004, 1.2345678, 65.535, 80.0]))
+    assert stored.tolist() == [0, 0, 1235, 65535, 65535]
+
+
+def test_an_existing_folder_is_refused_and_untouched(rollout):
+    before = sorted(rollout.rglob("*"))
+    with pytest.raises(UsageError, match="exists already"):
+        RolloutWriter(rollout, CAMERA)
+    assert sorted(rollout.rglob("*")) == before
+
+
+def break_off(folder, act):
+    """Write one frame of a rollout, then do something that ends the writing."""
+    with RolloutWriter(folder, CAMERA) as writer:
+        writer.add_frame(np.zeros((8, 12, 3), dtype=np.uint8), np.ones((8, 12)), some_poses(1)[0])
+        act(writer)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+def test_an_interrupted_collection_leaves_nothing_behind(tmp_path, error):
+    def interrupt(writer):
+        raise error
+
+    with pytest.raises(error):
+        break_off(tmp_path / "r1", interrupt)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_appears_meanwhile_is_not_replaced(tmp_path):
+    def collide(writer):
+        (tmp_path / "r2").mkdir()
+        (tmp_path / "r2" / "theirs").touch()
+        writer.publish({})
+
+    with pytest.raises(UsageError, match="another program made it"):
+        break_off(tmp_path / "r2", collide)
+    assert [path.name for path in tmp_path.rglob("*")] == ["r2", "theirs"]
+
+
+def test_a_parent_that_is_a_file_is_one_clear_error(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(RolloutError, match="cannot write there"):
+        break_off(tmp_path / "file" / "r", lambda writer: None)
+
+
+def test_a_full_disk_is_one_clear_error_and_leaves_nothing(tmp_path):
+    def fill(writer):
+        # /dev/full fails every write with ENOSPC, as a full disk does.
+        (writer.path("images") / "frame_00001.png").symlink_to("/dev/full")
+        writer.add_frame(np.zeros((8, 12, 3), dtype=np.uint8), np.ones((8, 12)), some_poses(1)[0])
+
+    with pytest.raises(RolloutError, match="cannot write there: No space left"):
+        break_off(tmp_path / "r", fill)
+    assert list(tmp_path.iterdir()) == []
+
+
+def edit_json(path, change):
+    value = json.loads(path.read_text())
+    change(value)
+    path.write_text(json.dumps(value))
+
+
+def flip(folder):
+    path = folder / "poses/frame_00001.txt"
+    np.savetxt(path, np.loadtxt(path) @ np.diag([1, -1, 1, 1]))
+
+
+def resize(folder, name, size, mode):
+    Image.new(mode, size).save(folder / name)
+
+
+def link_out(folder, name):
+    outside = folder.parent / "outside"
+    outside.write_bytes((folder / name).read_bytes())
+    (folder / name).unlink()
+    (folder / name).symlink_to(outside)
+
+
+DAMAGES = {
+    "no folder": (shutil.rmtree, "expected a rollout folder"),
+    "no rollout.json": (lambda f: (f / "rollout.json").unlink(), "rollout.json: expected this file"),
+    "not json": (lambda f: (f / "rollout.json").write_text("{"), "rollout.json: expected JSON"),
+    "a list": (lambda f: (f / "rollout.json").write_text("[]"), "expected a JSON object, found a list"),
+    "another format": (lambda f: edit_json(f / "rollout.json", lambda j: j.update(format="x")), "expected format"),
+    "another version": (
+        lambda f: edit_json(f / "rollout.json", lambda j: j.update(format_version=9)),
+        r"expected format version 1, found 9, written by avp-suite 0\.1\.0",
+    ),
+    "NaN focal length": (
+        lambda f: edit_json(f / "rollout.json", lambda j: j["camera"].update(fx=float("nan"))),
+        "camera.fx to be a number of pixels above 0, found nan",
+    ),
+    "no width": (lambda f: edit_json(f / "rollout.json", lambda j: j["camera"].pop("width")), "camera.width"),
+    "wrong count": (
+        lambda f: edit_json(f / "rollout.json", lambda j: j["counts"].update(frames=2)),
+        "frame_00002.png: a frame that rollout.json does not count",
+    ),
+    "count is text": (
+        lambda f: edit_json(f / "rollout.json", lambda j: j["counts"].update(frames="3")),
+        "counts.frames to be a whole number, found '3'",
+    ),
+    "missing image": (lambda f: (f / "images/frame_00001.png").unlink(), "images/frame_00001.png: expected this file"),
+    "missing depth": (lambda f: (f / "heldout/depth/frame_00000.png").unlink(), "heldout/depth/frame_00000.png"),
+    "missing pose": (lambda f: (f / "poses/frame_00002.txt").unlink(), "poses/frame_00002.txt: expected this file"),
+    "no heldout folder": (lambda f: shutil.rmtree(f / "heldout"), "heldout/images: expected 2 files"),
+    "empty image": (lambda f: (f / "images/frame_00000.png").write_bytes(b""), "8-bit RGB PNG, found an empty file"),
+    "a jpeg": (lambda f: Image.new("RGB", (12, 8)).save(f / "images/frame_00000.png", "JPEG"), "found something else"),
+    "wrong size": (lambda f: resize(f, "images/frame_00002.png", (8, 12), "RGB"), "expected 12x8 pixels.*found 8x12"),
+    "grey image": (lambda f: resize(f, "images/frame_00002.png", (12, 8), "L"), "expected a 8-bit RGB PNG"),
+    "8-bit depth": (lambda f: resize(f, "depth/frame_00002.png", (12, 8), "L"), "expected a 16-bit grey PNG"),
+    "NaN pose": (
+        lambda f: (f / "poses/frame_00001.txt").write_text("nan 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"),
+        "frame_00001.txt: not a rigid camera_to_world: expected finite numbers",
+    ),
+    "reflected pose": (flip, "frame_00001.txt: not a rigid camera_to_world: .*reflection"),
+    "short pose": (lambda f: (f / "poses/frame_00001.txt").write_text("1 2 3"), "found 3 numbers"),
+    "words in a pose": (
+        lambda f: (f / "poses/frame_00001.txt").write_text("one " * 16),
+        "expected 4 rows of 4 numbers",
+    ),
+    "image outside": (lambda f: link_out(f, "images/frame_00001.png"), "expected a path inside"),
+    "pose outside": (lambda f: link_out(f, "poses/frame_00000.txt"), "expected a path inside"),
+    "rollout.json outside": (lambda f: link_out(f, "rollout.json"), "expected a path inside"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_every_damage_is_an_error_that_names_the_file(rollout, damage):
+    spoil, words = DAMAGES[damage]
+    spoil(rollout)
+    with pytest.raises(RolloutError, match=words) as caught:
+        read_rollout(rollout)
+    assert str(rollout) in str(caught.value)
