@@ -1,7 +1,7 @@
 """The simulators by name, made once per scene and process."""
 
 import weakref
-from importlib import import_module
+from collections.abc import Callable
 from pathlib import Path
 
 from avp_habitat.errors import unknown_name
@@ -9,10 +9,21 @@ from avp_habitat.simulators.base import Frames, Simulator
 
 __all__ = ["SIMULATOR_NAMES", "Frames", "Simulator", "make_simulator"]
 
-_FACTORIES = {
-    "raycast": ("avp_habitat.simulators.raycast", "make"),
-    "habitat": ("avp_habitat.simulators.habitat", "make"),
-}
+
+def _raycast(scene: str) -> Simulator:
+    from avp_habitat.scenes.loader import load_scene
+    from avp_habitat.simulators.raycast import RaycastSimulator
+
+    return RaycastSimulator(load_scene(scene))
+
+
+def _habitat(scene: str) -> Simulator:
+    from avp_habitat.simulators.habitat import HabitatSimulator
+
+    return HabitatSimulator(scene)
+
+
+_FACTORIES: dict[str, Callable[[str], Simulator]] = {"raycast": _raycast, "habitat": _habitat}
 SIMULATOR_NAMES = tuple(_FACTORIES)
 # Simulators hold no state of an episode, so all environments of a process on one scene share one; it is freed with
 # the last of them.
@@ -37,7 +48,6 @@ def make_simulator(name: str, scene: str) -> Simulator:
     key = (name, scene, path.stat().st_mtime if path.is_file() else 0.0)
     simulator = _shared.get(key)
     if simulator is None:
-        module, factory = _FACTORIES[name]
-        simulator = getattr(import_module(module), factory)(scene)
+        simulator = _FACTORIES[name](scene)
         _shared[key] = simulator
     return simulator
