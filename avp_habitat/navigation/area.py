@@ -1,0 +1,194 @@
+"""Where agents can stand and how they move there, as numbers on the floor plane."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.navigation.settings import NavigationSettings
+from avp_habitat.scenes.mesh import TexturedMesh
+
+Float = NDArray[np.float64]
+SurfaceBelow = Callable[[Float], NDArray[np.floating]]
+"""Heights y `(n,)` of the first surface straight below `(n, 3)` points; not finite where there is none."""
+
+
+@dataclass(frozen=True)
+class NavigableArea:
+    """One connected part of the floor on which an agent can stand, seen from above (x to the right, z upwards).
+
+    Its outline decides what is inside: agents are points on the floor plane that stay within it. The mask is a picture
+    of it: a cell is navigable when its centre lies inside. Heights of points are ignored by all methods.
+    """
+
+    cell_m: float
+    """Side of a cell in metres."""
+    origin: Float
+    """`(2,)` x and z of the least corner of cell (0, 0), metres."""
+    mask: NDArray[np.bool_]
+    """`(rows, columns)` navigable cells; rows along +Z, columns along +X."""
+    heights: Float
+    """`(rows, columns)` floor height y in metres; continued a few cells beyond the navigable ones."""
+    rings: tuple[Float, ...]
+    """Outline: `(k, 2)` corners x, z in metres, the outer ring first, then holes; the inside lies on the left."""
+
+    @cached_property
+    def centres(self) -> Float:
+        """`(m, 3)` floor points of the navigable cells in the mask's row-major order, metres."""
+        rows, columns = np.nonzero(self.mask)
+        x = self.origin[0] + (columns + 0.5) * self.cell_m
+        z = self.origin[1] + (rows + 0.5) * self.cell_m
+        return np.stack([x, self.heights[rows, columns], z], axis=1)
+
+    @cached_property
+    def area_m2(self) -> float:
+        """Area within the outline, measured on the floor plane (a slope counts with its projection)."""
+        from avp_habitat.navigation.boundary import doubled_area
+
+        return sum(doubled_area(ring) for ring in self.rings) / 2
+
+    @cached_property
+    def diameter_m(self) -> float:
+        """Greatest distance between the centres of two navigable cells, in a straight line on the floor plane."""
+        rows = np.flatnonzero(self.mask.any(axis=1))
+        left = self.mask[rows].argmax(axis=1)
+        right = self.mask.shape[1] - 1 - self.mask[rows, ::-1].argmax(axis=1)
+        ends = np.stack([np.tile(rows, 2), np.concatenate([left, right])], axis=1).astype(np.float64)
+        longest = max(float(((ends - end) ** 2).sum(axis=1).max()) for end in ends)
+        return float(np.sqrt(longest)) * self.cell_m
+
+    def cell_of(self, points: Float) -> NDArray[np.int64]:
+        """`(n, 2)` row and column of the cells that `(n, 3)` points lie over; outside of the mask too."""
+        points = np.asarray(points, dtype=np.float64)
+        return np.floor((points[:, [2, 0]] - self.origin[::-1]) / self.cell_m).astype(np.int64)
+
+    def contains(self, points: Float) -> NDArray[np.bool_]:
+        """`(n,)` whether `(n, 3)` points lie over the navigable area."""
+        from avp_habitat.navigation.walls import are_inside
+
+        return are_inside(self._walls, _on_plane(points))
+
+    def floor_height(self, points: Float) -> Float:
+        """`(n,)` floor heights y in metres under `(n, 3)` points, linear between the centres of cells."""
+        points = np.asarray(points, dtype=np.float64)
+        at = (points[:, [2, 0]] - self.origin[::-1]) / self.cell_m - 0.5
+        at = np.clip(at, 0, np.array(self.mask.shape) - 1)
+        row, column = np.minimum(np.floor(at).astype(np.int64), np.maximum(np.array(self.mask.shape) - 2, 0)).T
+        row_after, column_after = np.minimum(np.stack([row, column], 1) + 1, np.array(self.mask.shape) - 1).T
+        up, across = at[:, 0] - row, at[:, 1] - column
+        near = self.heights[row, column] * (1 - across) + self.heights[row, column_after] * across
+        far = self.heights[row_after, column] * (1 - across) + self.heights[row_after, column_after] * across
+        return near * (1 - up) + far * up
+
+    def slide(self, positions: Float, displacements: Float) -> Float:
+        """Move agents; an obstacle lets them slide along it, and nothing lets them through.
+
+        Args:
+            positions: `(n, 3)` points over the navigable area, metres.
+            displacements: `(n, 3)` metres; only x and z count.
+
+        Returns:
+            `(n, 3)` end points on the floor. An agent that is not moved keeps x and z to the bit.
+
+        Raises:
+            ValueError: an agent starts outside of the area, or a number is not finite.
+        """
+        from avp_habitat.navigation.motion import slide
+
+        begin, move = _on_plane(positions), _on_plane(displacements)
+        if not (np.isfinite(begin).all() and np.isfinite(move).all()):
+            raise ValueError("expected finite positions and displacements, got NaN or infinity")
+        outside = np.flatnonzero(~self.contains(positions))
+        if len(outside):
+            raise ValueError(
+                f"expected agents over the navigable area; {len(outside)} of {len(begin)} are outside, "
+                f"the first at x, z = {begin[outside[0]]}"
+            )
+        return self._on_floor(slide(self._walls, begin, move))
+
+    def random_points(self, rng: np.random.Generator, count: int) -> Float:
+        """`(count, 3)` points on the floor, distributed uniformly over the area."""
+        low, high = self.rings[0].min(axis=0), self.rings[0].max(axis=0)
+        accepted = [np.empty((0, 3))]
+        while sum(map(len, accepted)) < count:
+            points = self._on_floor(low + rng.random((2 * count, 2)) * (high - low))
+            accepted.append(points[self.contains(points)])
+        return np.concatenate(accepted)[:count]
+
+    def geodesic_distance(self, start: Float, goals: Float) -> Float:
+        """Lengths of the shortest walks on the floor plane from `start` `(3,)` to `goals` `(n, 3)`.
+
+        Never shorter than the true shortest walk and at most 2 mm longer for every corner that it turns at.
+
+        Returns:
+            `(n,)` metres; inf where start or goal lies outside of the area.
+        """
+        return self._walks(start, goals)[0]
+
+    def geodesic_path(self, start: Float, goal: Float) -> Float:
+        """Corners `(k, 3)` of the shortest walk, from `start` `(3,)` to `goal` `(3,)`, on the floor; k = 0 for none."""
+        length, last, before = self._walks(start, np.asarray(goal)[None])
+        if not np.isfinite(length[0]):
+            return np.empty((0, 3))
+        corners, at = [_on_plane(np.asarray(goal)[None])[0]], int(last[0])
+        while at >= 0:
+            corners.append(self._roadmap.points[at])
+            at = int(before[at])
+        corners.append(_on_plane(np.asarray(start)[None])[0])
+        return self._on_floor(np.array(corners[::-1]))
+
+    def _walks(self, start: Float, goals: Float) -> tuple[Float, NDArray, NDArray]:
+        from avp_habitat.navigation.geodesic import distances
+
+        begin, ends = _on_plane(np.asarray(start)[None]), _on_plane(goals)
+        length, last, before = distances(self._walls, self._roadmap, begin[0], ends)
+        reachable = self.contains(np.asarray(goals)) & self.contains(np.asarray(start)[None])
+        return np.where(reachable, length, np.inf), last, before
+
+    def _on_floor(self, on_plane: Float) -> Float:
+        points = np.stack([on_plane[:, 0], np.zeros(len(on_plane)), on_plane[:, 1]], axis=1)
+        points[:, 1] = self.floor_height(points)
+        return points
+
+    @cached_property
+    def _walls(self):  # noqa: ANN202
+        from avp_habitat.navigation.walls import make_walls
+
+        return make_walls(list(self.rings))
+
+    @cached_property
+    def _roadmap(self):  # noqa: ANN202
+        from avp_habitat.navigation.geodesic import make_roadmap
+
+        return make_roadmap(self._walls, list(self.rings))
+
+
+def _on_plane(points: Float) -> Float:
+    """x and z of `(n, 3)` points."""
+    return np.ascontiguousarray(np.asarray(points, dtype=np.float64)[:, [0, 2]])
+
+
+def build_area(
+    mesh: TexturedMesh,
+    surface_below: SurfaceBelow,
+    *,
+    start: NDArray[np.floating] | None = None,
+    settings: NavigationSettings | None = None,
+) -> NavigableArea:
+    """The part of a mesh's floor on which an agent can stand, by Recast's rules as Habitat-Sim sets them.
+
+    Args:
+        mesh: metres, Y up, floors wound so that they face upwards.
+        surface_below: casts rays straight down on the same mesh; gives the floor's true height, which voxels round up.
+        start: `(3,)` point in metres that selects the part nearest to it; without it the largest part is taken that is
+            not a roof (open to the sky and over another part).
+        settings: Habitat-Sim's defaults when left out.
+
+    Raises:
+        SceneError: no floor, or no place with room for an agent; the message names likely causes.
+    """
+    from avp_habitat.navigation.build import build
+
+    return build(mesh, surface_below, start, settings or NavigationSettings())

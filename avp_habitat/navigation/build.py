@@ -1,0 +1,128 @@
+"""From a triangle mesh to its navigable area: voxels, standing places, one part, its outline, its floor."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.errors import SceneError
+from avp_habitat.navigation.area import Float, NavigableArea, SurfaceBelow
+from avp_habitat.navigation.boundary import outline
+from avp_habitat.navigation.filters import StandingPlaces, standing_places
+from avp_habitat.navigation.heightfield import level_triangles, voxelise
+from avp_habitat.navigation.parts import Part, connected_parts, lay_flat, main_part, part_near
+from avp_habitat.navigation.settings import NavigationSettings
+from avp_habitat.navigation.walls import SKIN_M, are_inside, make_walls
+from avp_habitat.scenes.mesh import TexturedMesh
+
+_REACH_CELLS = 8
+"""How far floor heights are continued beyond the navigable cells: farther than an outline lies from its cells."""
+
+
+def build(
+    mesh: TexturedMesh, surface_below: SurfaceBelow, start: NDArray | None, settings: NavigationSettings
+) -> NavigableArea:
+    """See `avp_habitat.navigation.area.build_area`."""
+    vertices, triangles = _used(mesh)
+    _check_floor(vertices, triangles, settings)
+    field = voxelise(vertices, triangles, settings)
+    places = standing_places(field, settings)
+    part = connected_parts(places, settings.radius_voxels, settings.region_min_size**2)
+    if not (part >= 0).any():
+        raise SceneError(_no_place(vertices, settings))
+    chosen = main_part(places, part) if start is None else _part_at(places, part, start, field, settings)
+    flat = lay_flat(places, part == chosen, field.shape)
+    rings = [
+        field.origin[[0, 2]].astype(np.float64) + ring * settings.voxel_m
+        for ring in outline(flat.inside, settings.edge_max_error)
+    ]
+    if not rings:
+        raise SceneError(_no_place(vertices, settings))
+    return _with_floor(flat, rings, field.origin.astype(np.float64), surface_below, settings)
+
+
+def _used(mesh: TexturedMesh) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Vertices and triangles; vertices that no triangle uses do not widen the voxels' box."""
+    if not len(mesh.triangles):
+        raise SceneError("the scene's mesh has no triangles: expected a furnished room; is it a point cloud?")
+    used = np.zeros(len(mesh.vertices), bool)
+    used[mesh.triangles] = True
+    vertices = np.ascontiguousarray(mesh.vertices[used], dtype=np.float32)
+    if not np.isfinite(vertices).all():
+        raise SceneError("the scene's mesh has vertices that are NaN or infinite: expected metres")
+    number = np.cumsum(used, dtype=np.int64) - 1
+    return vertices, np.ascontiguousarray(number[mesh.triangles], dtype=np.int32)
+
+
+def _check_floor(vertices: NDArray[np.float32], triangles: NDArray[np.int32], settings: NavigationSettings) -> None:
+    if level_triangles(vertices, triangles, settings.max_slope_deg).any():
+        return
+    found = f"the scene has no floor: none of its {len(triangles)} triangles faces upwards (+Y) within "
+    found += f"{settings.max_slope_deg:g}° of level"
+    if level_triangles(vertices, triangles[:, ::-1], settings.max_slope_deg).any():
+        raise SceneError(f"{found}, but some face downwards; are the triangles wound the wrong way round?")
+    raise SceneError(f"{found}; is the mesh Z-up instead of Y-up?")
+
+
+def _no_place(vertices: NDArray[np.float32], settings: NavigationSettings) -> str:
+    size = vertices.max(axis=0) - vertices.min(axis=0)
+    least = settings.region_min_size**2 * settings.voxel_m**2
+    return (
+        f"no agent can stand in the scene, which measures {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m (x, y, z): "
+        f"expected {least:g} m² of connected floor with {settings.height_voxels * settings.voxel_height_m:g} m of free "
+        "height; is it not in metres, Z-up instead of Y-up, its floor wound to face downwards, or the ceiling lower "
+        f"than {settings.agent_height_m:g} m?"
+    )
+
+
+def _part_at(places: StandingPlaces, part: NDArray, start: NDArray, field, settings: NavigationSettings) -> int:
+    column, level, row = (np.asarray(start, dtype=np.float64) - field.origin) / [
+        settings.voxel_m,
+        settings.voxel_height_m,
+        settings.voxel_m,
+    ]
+    return part_near(places, part, field.shape[1], int(row), int(column), float(level))
+
+
+def _with_floor(
+    flat: Part, rings: list[Float], low: Float, surface_below: SurfaceBelow, settings: NavigationSettings
+) -> NavigableArea:
+    """Sample the outline at the cells' centres, which lie in the middle of voxels, and cast a ray down at each."""
+    stride = max(1, round(settings.cell_m / settings.voxel_m))
+    cell = stride * settings.voxel_m
+    origin = low[[0, 2]] + (settings.voxel_m - cell) / 2
+    rows, columns = ((size + stride - 1) // stride for size in flat.inside.shape)
+    x = origin[0] + (np.arange(columns) + 0.5) * cell
+    z = origin[1] + (np.arange(rows) + 0.5) * cell
+    centres = np.stack(np.meshgrid(x, z), axis=-1)
+    mask = are_inside(make_walls(rings), centres.reshape(-1, 2)).reshape(rows, columns)
+    if not mask.any():
+        raise SceneError(f"the navigable area is smaller than one cell of {cell:g} m; is the scene not in metres?")
+    voxel_floor = np.where(flat.inside, low[1] + flat.floor * settings.voxel_height_m, np.nan)
+    above = continued(voxel_floor, _REACH_CELLS, np.fmax)[::stride, ::stride][mask]
+    top = np.nan_to_num(above, nan=float(np.nanmax(voxel_floor))) + settings.climb_voxels * settings.voxel_height_m
+    found = surface_below(np.stack([centres[mask][:, 0], top, centres[mask][:, 1]], axis=1))
+    depth = top - np.asarray(found, dtype=np.float64)
+    deepest = (2 * settings.climb_voxels + 1) * settings.voxel_height_m + SKIN_M
+    heights = np.full(mask.shape, np.nan)
+    heights[mask] = np.where((depth >= 0) & (depth <= deepest), found, np.nan)
+    if not np.isfinite(heights).any():
+        raise SceneError("no ray meets the floor below the navigable cells: the mesh and its ray caster disagree")
+    heights = continued(heights, _REACH_CELLS, np.fmin)
+    return NavigableArea(
+        cell, origin, mask, np.where(np.isfinite(heights), heights, np.nanmedian(heights)), tuple(rings)
+    )
+
+
+def continued(heights: Float, reach: int, choose: np.ufunc) -> Float:
+    """Fill NaN pixels from their four neighbours, ring by ring.
+
+    Args:
+        heights: `(rows, columns)`, NaN where unknown.
+        reach: how many pixels far.
+        choose: which of the neighbours' values wins, `np.fmin` or `np.fmax`.
+    """
+    heights = heights.copy()
+    for _ in range(reach):
+        padded = np.pad(heights, 1, constant_values=np.nan)
+        best = choose(choose(padded[:-2, 1:-1], padded[2:, 1:-1]), choose(padded[1:-1, :-2], padded[1:-1, 2:]))
+        heights = np.where(np.isnan(heights), best, heights)
+    return heights

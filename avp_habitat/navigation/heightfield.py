@@ -1,0 +1,217 @@
+"""Conservative voxelisation of a triangle mesh into columns of solid spans, by Recast's rules.
+
+Every triangle is cut along the borders of the columns that it touches, and fills in each of them the voxels between the
+lowest and the highest point of its piece. Touching spans of a column become one; its top is walkable when the piece
+that made the top, or one whose top lies within the climb of it, is. Single precision and the triangles' order are kept
+as Recast has them, because both decide on which side of a voxel border a level floor falls.
+Source: M. Mononen, Recast Navigation (rasterisation).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from avp_habitat.errors import SceneError
+from avp_habitat.navigation.settings import NavigationSettings
+
+_MOST_COLUMNS = 40_000_000
+_HIGHEST_VOXEL = 8191
+
+
+@dataclass(frozen=True)
+class Heightfield:
+    """Solid spans of all columns, column after column (row-major), each column from the bottom to the top."""
+
+    origin: NDArray[np.float32]
+    """`(3,)` least corner of voxel (0, 0, 0) in metres."""
+    shape: tuple[int, int]
+    """Rows (along +Z) and columns (along +X) of the floor plane."""
+    first: NDArray[np.int64]
+    """`(rows * columns + 1,)` index of each column's first span."""
+    bottom: NDArray[np.int32]
+    """`(n,)` lowest voxel of each span."""
+    top: NDArray[np.int32]
+    """`(n,)` first voxel above each span."""
+    walkable: NDArray[np.bool_]
+    """`(n,)` whether an agent may step on the span's top."""
+
+
+def level_triangles(vertices: NDArray[np.float32], triangles: NDArray[np.int32], max_slope_deg: float) -> NDArray:
+    """`(t,)` bool: whether triangles face upwards within the slope; their winding tells what is up."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    length = np.sqrt((normal * normal).sum(axis=1, dtype=np.float32))
+    return normal[:, 1] > np.float32(np.cos(np.radians(max_slope_deg))) * length
+
+
+def voxelise(vertices: NDArray[np.float32], triangles: NDArray[np.int32], settings: NavigationSettings) -> Heightfield:
+    """Voxelise a mesh.
+
+    Args:
+        vertices: `(v, 3)` metres, Y up, finite.
+        triangles: `(t, 3)` vertex indices.
+        settings: voxel sizes, slope and climb.
+
+    Raises:
+        SceneError: the mesh is so wide that its columns would not fit into memory; it is not in metres.
+    """
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    cell, level = np.float32(settings.voxel_m), np.float32(settings.voxel_height_m)
+    columns, rows = (max(1, int((high[axis] - low[axis]) / cell + np.float32(0.5))) for axis in (0, 2))
+    if rows * columns > _MOST_COLUMNS:
+        raise SceneError(
+            f"the scene is {high[0] - low[0]:.0f} x {high[2] - low[2]:.0f} m wide: expected at most "
+            f"{_MOST_COLUMNS * settings.voxel_m**2:.0f} m²; is it in millimetres or centimetres instead of metres?"
+        )
+    level_enough = level_triangles(vertices, triangles, settings.max_slope_deg)
+    first, bottom, top, walkable = _rasterise(
+        vertices, triangles, level_enough, low, high, cell, level, rows, columns, settings.climb_voxels
+    )
+    return Heightfield(low, (rows, columns), first, bottom, top, walkable)
+
+
+@njit(cache=True)
+def _cut(polygon, count, axis, limit, below, above):  # noqa: PLR0913
+    """Cut a convex polygon at a coordinate; returns the numbers of vertices below and above."""
+    low = high = 0
+    for i in range(count):
+        j = i - 1 if i > 0 else count - 1
+        side, side_before = limit - polygon[i, axis], limit - polygon[j, axis]
+        if (side > 0 and side_before < 0) or (side < 0 and side_before > 0):
+            share = side_before / (side_before - side)
+            for k in range(3):
+                below[low, k] = above[high, k] = polygon[j, k] + (polygon[i, k] - polygon[j, k]) * share
+            low, high = low + 1, high + 1
+        if side >= 0:
+            below[low] = polygon[i]
+            low += 1
+        if side <= 0:
+            above[high] = polygon[i]
+            high += 1
+    return low, high
+
+
+@njit(cache=True)
+def _grown(array):
+    bigger = np.empty((2 * array.shape[0], array.shape[1]), array.dtype)
+    bigger[: array.shape[0]] = array
+    return bigger
+
+
+@njit(cache=True)
+def _insert(head, pool, state, column, low, high, walkable, climb):  # noqa: PLR0913
+    """Add a span to a column's linked list, melting it with those that it touches.
+
+    `pool` rows are (bottom, top, walkable, next); `state` is (first free row of the pool or -1, rows ever used).
+    """
+    before, at = -1, head[column]
+    while at >= 0 and pool[at, 0] <= high:
+        after = pool[at, 3]
+        if pool[at, 1] < low:
+            before = at
+        else:
+            low, high = min(low, pool[at, 0]), max(high, pool[at, 1])
+            if high - pool[at, 1] <= climb:
+                walkable = max(walkable, pool[at, 2])
+            pool[at, 3], state[0] = state[0], at
+            if before >= 0:
+                pool[before, 3] = after
+            else:
+                head[column] = after
+        at = after
+    slot = state[0]
+    if slot >= 0:
+        state[0] = pool[slot, 3]
+    else:
+        slot = state[1]
+        state[1] += 1
+    pool[slot, 0], pool[slot, 1], pool[slot, 2], pool[slot, 3] = low, high, walkable, at
+    if before >= 0:
+        pool[before, 3] = slot
+    else:
+        head[column] = slot
+
+
+@njit(cache=True)
+def _voxel_range(piece, count, floor, ceiling, level):
+    """Lowest voxel and first voxel above of a polygon's piece; (0, 0) when it is outside."""
+    low, high = piece[0, 1], piece[0, 1]
+    for i in range(1, count):
+        low, high = min(low, piece[i, 1]), max(high, piece[i, 1])
+    low, high = low - floor, high - floor
+    if high < 0 or low > ceiling - floor:
+        return 0, 0
+    per_metre = np.float32(1) / level
+    bottom = min(max(int(np.floor(max(low, np.float32(0)) * per_metre)), 0), _HIGHEST_VOXEL - 1)
+    top = int(np.ceil(min(high, ceiling - floor) * per_metre))
+    return bottom, min(max(top, bottom + 1), _HIGHEST_VOXEL)
+
+
+@njit(cache=True)
+def _extent(polygon, count, axis, origin, per_metre, cells):
+    """First and last cell that a polygon touches along an axis; one before the first where it starts outside."""
+    low, high = polygon[0, axis], polygon[0, axis]
+    for i in range(1, count):
+        low, high = min(low, polygon[i, axis]), max(high, polygon[i, axis])
+    start, end = int((low - origin) * per_metre), int((high - origin) * per_metre)
+    if end < 0 or (start >= cells and axis == 0):
+        return 0, -1
+    return min(max(start, -1), cells - 1), min(max(end, 0), cells - 1)
+
+
+@njit(cache=True)
+def _rasterise(vertices, triangles, level_enough, low, high, cell, level, rows, columns, climb):  # noqa: PLR0913
+    head = np.full(rows * columns, -1, np.int64)
+    pool = np.empty((max(1024, rows * columns), 4), np.int64)
+    state = np.array([-1, 0])
+    rest, row, piece, spare = (
+        np.empty((12, 3), np.float32),
+        np.empty((12, 3), np.float32),
+        np.empty((12, 3), np.float32),
+        np.empty((12, 3), np.float32),
+    )
+    per_metre = np.float32(1) / cell
+    for t in range(len(triangles)):
+        for k in range(3):
+            rest[k] = vertices[triangles[t, k]]
+        left = 3
+        start_z, end_z = _extent(rest, 3, 2, low[2], per_metre, rows)
+        for z in range(start_z, end_z + 1):
+            limit_z = low[2] + np.float32(z) * cell + cell
+            in_row, left = _cut(rest, left, 2, limit_z, row, spare)
+            rest, spare = spare, rest
+            if in_row < 3 or z < 0:
+                continue
+            start_x, end_x = _extent(row, in_row, 0, low[0], per_metre, columns)
+            for x in range(start_x, end_x + 1):
+                limit_x = low[0] + np.float32(x) * cell + cell
+                count, in_row = _cut(row, in_row, 0, limit_x, piece, spare)
+                row, spare = spare, row
+                if count < 3 or x < 0:
+                    continue
+                bottom, top = _voxel_range(piece, count, low[1], high[1], level)
+                if top > bottom:
+                    if state[0] < 0 and state[1] == len(pool):
+                        pool = _grown(pool)
+                    _insert(head, pool, state, z * columns + x, bottom, top, np.int64(level_enough[t]), climb)
+    return _flattened(head, pool)
+
+
+@njit(cache=True)
+def _flattened(head, pool):
+    first = np.zeros(len(head) + 1, np.int64)
+    for column in range(len(head)):
+        count, at = 0, head[column]
+        while at >= 0:
+            count, at = count + 1, pool[at, 3]
+        first[column + 1] = first[column] + count
+    bottom, top = np.empty(first[-1], np.int32), np.empty(first[-1], np.int32)
+    walkable = np.empty(first[-1], np.bool_)
+    for column in range(len(head)):
+        at = head[column]
+        for i in range(first[column], first[column + 1]):
+            bottom[i], top[i], walkable[i] = pool[at, 0], pool[at, 1], pool[at, 2] != 0
+            at = pool[at, 3]
+    return first, bottom, top, walkable

@@ -1,0 +1,140 @@
+"""The walls of an outline in a grid of bins, so that a straight line meets only the walls near it."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+SKIN_M = 1e-4
+"""Distance in metres at which agents stop before a wall, so that every later test against it is safe from rounding."""
+
+
+class Walls(NamedTuple):
+    """Directed segments with the inside on their left, and the bins that they pass through."""
+
+    ends: NDArray[np.float64]
+    """`(k, 4)` x and z of the begin, x and z of the end, metres."""
+    origin: NDArray[np.float64]
+    """`(2,)` least x and z of the bins."""
+    bin_m: float
+    """Side of a bin in metres."""
+    shape: tuple[int, int]
+    """Bins along z and x."""
+    first: NDArray[np.int64]
+    """`(bins + 1,)` index of each bin's first entry in `member`."""
+    member: NDArray[np.int64]
+    """Indices of walls, bin after bin."""
+
+
+def make_walls(rings: list[NDArray[np.float64]], bin_m: float = 0.25) -> Walls:
+    """Walls along closed rings.
+
+    Args:
+        rings: `(k, 2)` corners (x, z) in metres each, the inside on the left.
+        bin_m: side of a bin in metres.
+    """
+    ends = np.concatenate([np.hstack([ring, np.roll(ring, -1, axis=0)]) for ring in rings])
+    ends = np.ascontiguousarray(ends[np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1]) > 0])
+    corners = ends[:, :2]
+    origin = corners.min(axis=0) - bin_m / 2
+    columns, rows = (int(n) for n in np.ceil((corners.max(axis=0) + bin_m / 2 - origin) / bin_m))
+    first, member = _fill_bins(ends, origin, bin_m, (rows, columns))
+    return Walls(ends, origin, bin_m, (rows, columns), first, member)
+
+
+@njit(cache=True)
+def _rows(az, bz, origin, bin_m, rows):
+    """First and last row of bins that a segment passes through, the skin included."""
+    low, high = min(az, bz) - SKIN_M - origin[1], max(az, bz) + SKIN_M - origin[1]
+    return max(int(np.floor(low / bin_m)), 0), min(int(np.floor(high / bin_m)), rows - 1)
+
+
+@njit(cache=True)
+def _columns(ax, az, bx, bz, row, origin, bin_m, columns):  # noqa: PLR0913
+    """First and last column of bins that the part of a segment in a row passes through, the skin included."""
+    low, high = origin[1] + row * bin_m - 2 * SKIN_M, origin[1] + (row + 1) * bin_m + 2 * SKIN_M
+    begin, end = 0.0, 1.0
+    if az != bz:
+        one, two = (low - az) / (bz - az), (high - az) / (bz - az)
+        begin, end = max(min(one, two), 0.0), min(max(one, two), 1.0)
+    x0, x1 = ax + begin * (bx - ax), ax + end * (bx - ax)
+    left, right = min(x0, x1) - 2 * SKIN_M - origin[0], max(x0, x1) + 2 * SKIN_M - origin[0]
+    return max(int(np.floor(left / bin_m)), 0), min(int(np.floor(right / bin_m)), columns - 1)
+
+
+@njit(cache=True)
+def _fill_bins(ends, origin, bin_m, shape):
+    rows, columns = shape
+    count = np.zeros(rows * columns + 1, np.int64)
+    member = np.empty(0, np.int64)
+    for writing in (False, True):
+        for k in range(len(ends)):
+            ax, az, bx, bz = ends[k]
+            first_row, last_row = _rows(az, bz, origin, bin_m, rows)
+            for row in range(first_row, last_row + 1):
+                left, right = _columns(ax, az, bx, bz, row, origin, bin_m, columns)
+                for at in range(row * columns + left, row * columns + right + 1):
+                    if writing:
+                        member[count[at]] = k
+                        count[at] += 1
+                    else:
+                        count[at + 1] += 1
+        if not writing:
+            count = np.cumsum(count)
+            member = np.empty(count[-1], np.int64)
+    first = np.zeros_like(count)
+    first[1:] = count[:-1]
+    return first, member
+
+
+@njit(cache=True)
+def near_line(walls, ax, az, bx, bz, seen, ticket, found):  # noqa: PLR0913
+    """Collect the walls within the skin of a line (and some farther ones), each once.
+
+    `seen` `(k,)` holds the last ticket of each wall, `found` `(k,)` takes their indices; returns how many.
+    """
+    count = 0
+    rows, columns = walls.shape
+    first_row, last_row = _rows(az, bz, walls.origin, walls.bin_m, rows)
+    for row in range(first_row, last_row + 1):
+        left, right = _columns(ax, az, bx, bz, row, walls.origin, walls.bin_m, columns)
+        for at in range(row * columns + left, row * columns + right + 1):
+            for entry in range(walls.first[at], walls.first[at + 1]):
+                k = walls.member[entry]
+                if seen[k] != ticket:
+                    seen[k] = ticket
+                    found[count] = k
+                    count += 1
+    return count
+
+
+@njit(cache=True)
+def is_inside(walls, x, z):
+    """Whether a point lies within the outline: a ray along +X crosses the walls an odd number of times."""
+    rows, columns = walls.shape
+    row = int(np.floor((z - walls.origin[1]) / walls.bin_m))
+    if row < 0 or row >= rows:
+        return False
+    ends = walls.ends
+    inside = False
+    start = max(int(np.floor((x - walls.origin[0]) / walls.bin_m)), 0)
+    for at in range(row * columns + start, (row + 1) * columns):
+        for entry in range(walls.first[at], walls.first[at + 1]):
+            k = walls.member[entry]
+            if (ends[k, 1] > z) != (ends[k, 3] > z):
+                share = (z - ends[k, 1]) / (ends[k, 3] - ends[k, 1])
+                crossing = ends[k, 0] + share * (ends[k, 2] - ends[k, 0])
+                column = int(np.floor((crossing - walls.origin[0]) / walls.bin_m))
+                if crossing > x and column == at - row * columns:
+                    inside = not inside
+    return inside
+
+
+@njit(cache=True)
+def are_inside(walls, points):
+    """`(n,)` bool for `(n, 2)` points (x, z)."""
+    result = np.empty(len(points), np.bool_)
+    for i in range(len(points)):
+        result[i] = is_inside(walls, points[i, 0], points[i, 1])
+    return result
