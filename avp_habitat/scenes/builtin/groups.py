@@ -1,0 +1,186 @@
+"""Furniture that belongs together, arranged relative to one another."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from avp_habitat.scenes.builtin import decor, seating, storage, tables
+from avp_habitat.scenes.builtin.dice import Dice
+from avp_habitat.scenes.builtin.kit import Kit
+from avp_habitat.scenes.builtin.piece import Piece, shifted
+from avp_habitat.scenes.builtin.shapes import Material, Rectangle, Surface, box, yawed
+
+GAP_M = 0.03
+"""Between furniture and the wall behind it: the skirting board is 15 mm thick."""
+
+
+@dataclass(frozen=True, eq=False)
+class Member:
+    """A piece in a group; the group's frame has its back at z = 0 and its front towards +z."""
+
+    piece: Piece
+    """What."""
+    x: float
+    """Metres to the right of the middle, for somebody who looks along -z at the group's back."""
+    z: float
+    """Metres in front of the back."""
+    quarter: int = 0
+    """Quarter turns about +Y, counter-clockwise from above."""
+    twist: float = 0.0
+    """Further turn in radians, small."""
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Pieces with fixed places relative to one another."""
+
+    members: tuple[Member, ...]
+    """The pieces."""
+    clear: tuple[Rectangle, ...] = ()
+    """x0, z0, x1, z1 in front of furniture that people need to use it."""
+
+
+Arrange = Callable[[float], Group | None]
+"""From the free depth in metres in front of the group's back to the group, or None where it does not fit."""
+
+
+def against_wall(piece: Piece, clear: float) -> Arrange:
+    """One piece with its back to a wall and free floor in front of it, metres."""
+    front = GAP_M + piece.depth
+    area = (-piece.width / 2, front, piece.width / 2, front + clear)
+    group = Group((Member(piece, 0.0, GAP_M + piece.depth / 2),), (area,))
+    return lambda depth: group if depth > front + clear else None
+
+
+def living(kit: Kit, dice: Dice) -> Arrange:
+    """A television and a sofa that faces it over a coffee table on a rug, with armchair, side table and lamp."""
+    unit, couch = storage.television(kit, dice), seating.sofa(kit, dice)
+    table, carpet = tables.coffee_table(kit, dice), decor.rug(kit, 2.3, 1.6)
+    seat, beside, lamp = seating.armchair(kit, dice), tables.side_table(kit, dice), decor.floor_lamp(kit, dice)
+    side, twist = dice.pick((-1, 1)), dice.number(-0.2, 0.2)
+    free = dice.number(3.3, 3.8)
+
+    def arrange(depth: float) -> Group | None:
+        if depth < 3.1:
+            return None
+        back = depth - GAP_M if depth < 4.4 else min(free, depth)
+        sofa_z = back - couch.depth / 2
+        table_z = sofa_z - couch.depth / 2 - 0.42 - table.depth / 2
+        members = [
+            Member(unit, 0.0, GAP_M + unit.depth / 2),
+            Member(couch, 0.0, sofa_z, 2),
+            Member(table, 0.0, table_z),
+            Member(carpet, 0.0, table_z + 0.1),
+            Member(beside, -side * (couch.width / 2 + 0.26), sofa_z - 0.16, 2),
+        ]
+        if back > 3.0:
+            members.append(Member(seat, side * (couch.width / 2 + 0.15), table_z - 0.12, 3 if side > 0 else 1, twist))
+            members.append(Member(lamp, side * (couch.width / 2 + 0.25), sofa_z + 0.2))
+        return Group(tuple(members), ((-0.6, 0.5, 0.6, table_z - table.depth / 2),))
+
+    return arrange
+
+
+def dining(kit: Kit, dice: Dice) -> Arrange:
+    """A table with chairs around it, sometimes on a rug; needs free floor on all sides."""
+    wood: Material = dice.pick((kit.wood, kit.dark_wood))
+    members: list[Member] = []
+    if dice.chance(0.35):
+        radius = dice.number(0.5, 0.6)
+        table = tables.round_table(kit, dice, radius)
+        half_x = half_z = radius + 0.32
+        for quarter, (x, z) in enumerate(((0, -1), (-1, 0), (0, 1), (1, 0))):
+            one = seating.chair(kit, dice, wood)
+            members.append(Member(one, x * half_x, z * half_z, (0, 1, 2, 3)[quarter], dice.number(-0.12, 0.12)))
+    else:
+        pairs = dice.pick((2, 2, 3))
+        table = tables.dining_table(kit, dice, 0.62 * pairs + 0.2, 0.85)
+        half_x, half_z = table.width / 2, table.depth / 2 + 0.3
+        for index in range(pairs):
+            x = (index - (pairs - 1) / 2) * 0.62
+            for quarter, z in ((0, -half_z), (2, half_z)):
+                one = seating.chair(kit, dice, wood)
+                members.append(Member(one, x, z, quarter, dice.number(-0.1, 0.1)))
+    reach = half_z + 0.4
+    members = [Member(m.piece, m.x, m.z + reach, m.quarter, m.twist) for m in members]
+    members.append(Member(table, 0.0, reach))
+    if dice.chance(0.5):
+        members.append(Member(decor.rug(kit, 2 * half_x + 0.7, 2 * half_z + 0.5), 0.0, reach))
+    group = Group(tuple(members))
+    return lambda depth: group if depth > 2 * reach else None
+
+
+def sleeping(kit: Kit, dice: Dice) -> Arrange:
+    """A bed with its head to the wall, one or two night stands and a rug beside it."""
+    couch = seating.bed(kit, dice)
+    stands = [tables.side_table(kit, dice) for _ in range(2)]
+    z = GAP_M + couch.depth / 2
+    members = [Member(couch, 0.0, z)]
+    sides = (-1, 1) if couch.width > 1.2 else (dice.pick((-1, 1)),)
+    for stand, side in zip(stands, sides, strict=False):
+        members.append(Member(stand, side * (couch.width / 2 + 0.26), GAP_M + stand.depth / 2))
+    members.append(Member(decor.rug(kit, 1.0, 1.5), sides[0] * (couch.width / 2 + 0.55), 1.5))
+    edge = couch.width / 2
+    walk = (edge, 0.7, edge + 0.6, 1.9) if sides[0] > 0 else (-edge - 0.6, 0.7, -edge, 1.9)
+    group = Group(tuple(members), (walk,))
+    return lambda depth: group if depth > couch.depth + 0.7 else None
+
+
+def working(kit: Kit, dice: Dice) -> Arrange:
+    """A desk against the wall and a swivel chair before it."""
+    table, stool = tables.desk(kit, dice), seating.office_chair(kit, dice)
+    z = GAP_M + table.depth / 2
+    group = Group(
+        (Member(table, 0.0, z), Member(stool, -0.1, GAP_M + table.depth + 0.36, 2, dice.number(-0.4, 0.4))),
+        ((-0.5, 0.7, 0.5, 1.6),),
+    )
+    return lambda depth: group if depth > 1.7 else None
+
+
+def reading(kit: Kit, dice: Dice) -> Arrange:
+    """An armchair with a floor lamp and a pouf."""
+    seat, lamp, stool = seating.armchair(kit, dice), decor.floor_lamp(kit, dice), seating.pouf(kit, dice)
+    side = dice.pick((-1, 1))
+    group = Group(
+        (
+            Member(seat, 0.0, 0.12 + seat.depth / 2, 0, dice.number(-0.25, 0.25)),
+            Member(lamp, side * (seat.width / 2 + 0.34), 0.3),
+            Member(stool, 0.0, 0.12 + seat.depth + 0.45),
+        )
+    )
+    return lambda depth: group if depth > 2.2 else None
+
+
+def divider(kit: Kit, dice: Dice, ceiling: float) -> Arrange:
+    """A partition wall or a double shelf that runs from a wall into the room and hides what is behind it."""
+    masonry = dice.chance(0.5)
+    wall = dice.pick((kit.feature_wall, kit.papered_wall))
+    share = dice.number(0.4, 0.52)
+    shelf_dice = Dice(dice.whole(0, 1 << 30))
+
+    def arrange(depth: float) -> Group | None:
+        length = round(min(depth * share, 2.4), 2)
+        if length < 1.1 or depth - length < 1.2:
+            return None
+        if masonry:
+            piece = partition(kit, Dice(7), wall, length, ceiling)
+            return Group((Member(piece, 0.0, length / 2, 1),))
+        piece = storage.divider_shelf(kit, shelf_dice, length)
+        return Group((Member(piece, 0.0, GAP_M + length / 2, 1),))
+
+    return arrange
+
+
+def partition(kit: Kit, dice: Dice, material: Material, length: float, ceiling: float) -> Piece:
+    """A stub of wall along x with a skirting board and a picture on each side."""
+    thick = 0.12
+    made: list[Surface] = box(
+        (length, ceiling, thick), (0, ceiling / 2, 0), material, faces=("front", "back"), pitch=0.25
+    )
+    made += box((length, ceiling, thick), (0, ceiling / 2, 0), kit.trim, faces=("left", "right"), pitch=0.25)
+    made += box(
+        (length + 0.02, 0.09, thick + 0.03), (0, 0.045, 0), kit.trim, faces=("front", "back", "left", "right", "top")
+    )
+    wide = min(length - 0.5, dice.number(0.6, 0.9))
+    front = shifted(decor.picture(kit, dice, wide, 0.62), 0, 1.55, thick / 2)
+    back = yawed(shifted(decor.picture(kit, dice, wide * 0.8, 0.7), 0, 1.55, thick / 2), 3.14159265)
+    return Piece("partition", made + front + back, length + 0.02, thick + 0.07, ceiling)

@@ -1,0 +1,149 @@
+"""Light baked into vertices: daylight, lamps with soft shadows, darkening where surfaces meet."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.scenes.builtin.piece import Lamp
+from avp_habitat.scenes.builtin.shapes import Surface
+from avp_habitat.scenes.builtin.shell import Shell
+
+Float = NDArray[np.float64]
+
+VOXEL_M = 0.1
+PADDING = 8
+"""Voxels around the room that count as solid."""
+
+
+class Voxels:
+    """What of the room's space is filled, and how filled the surroundings of each place are."""
+
+    def __init__(self, shell: Shell, surfaces: list[Surface]) -> None:
+        """Fill every voxel that a surface passes through and everything outside the room.
+
+        Args:
+            shell: the room.
+            surfaces: what stands in it.
+        """
+        x0, z0, x1, z1 = shell.bounds
+        self._origin = np.array([x0, 0.0, z0]) - PADDING * VOXEL_M
+        extent = np.array([x1 - x0, shell.ceiling, z1 - z0])
+        shape = tuple(int(n) for n in np.ceil(extent / VOXEL_M) + 2 * PADDING)
+        filled = np.ones(shape, np.float32)
+        inside = [np.arange(n) * VOXEL_M + VOXEL_M / 2 - PADDING * VOXEL_M for n in shape]
+        room = [(along > 0) & (along < extent[axis]) for axis, along in enumerate(inside)]
+        filled[np.ix_(*room)] = 0
+        if shell.notch is not None:
+            a, b, c, d = shell.notch
+            x, z = inside[0] + x0, inside[2] + z0
+            filled[np.ix_((x > a) & (x < c), room[1], (z > b) & (z < d))] = 1
+        self.solid = filled
+        for surface in surfaces:
+            index = self._index(_samples(surface))
+            filled[index[:, 0], index[:, 1], index[:, 2]] = 1
+        self.soft = {reach: _blurred(filled, reach) for reach in (1, 2, 4, 7)}
+
+    def _index(self, points: Float) -> NDArray[np.int64]:
+        index = np.floor((points - self._origin) / VOXEL_M).astype(np.int64)
+        return np.clip(index, 0, np.array(self.solid.shape) - 1)
+
+    def fullness(self, points: Float, reach: int) -> NDArray[np.float32]:
+        """Trilinear share of filled space within `reach` voxels of `(n, 3)` points."""
+        grid = self.soft[reach]
+        place = np.clip((points - self._origin) / VOXEL_M - 0.5, 0, np.array(grid.shape) - 1.001)
+        low = np.floor(place).astype(np.int64)
+        part = (place - low).astype(np.float32)
+        total = np.zeros(len(points), np.float32)
+        for corner in range(8):
+            bits = np.array([corner >> 2 & 1, corner >> 1 & 1, corner & 1])
+            weight = np.prod(np.where(bits, part, 1 - part), axis=1)
+            at = low + bits
+            total += weight * grid[at[:, 0], at[:, 1], at[:, 2]]
+        return total
+
+    def clear_view(self, points: Float, light: Float, steps: int = 14) -> NDArray[np.float32]:
+        """Share of light that reaches `(n, 3)` points from a `(3,)` point past what is filled."""
+        grid = self.soft[1]
+        through = np.ones(len(points), np.float32)
+        for step in range(1, steps):
+            at = self._index(points + (light - points) * (step / steps))
+            through *= 1 - 0.55 * grid[at[:, 0], at[:, 1], at[:, 2]]
+        return through
+
+
+def _samples(surface: Surface) -> Float:
+    """Points on the triangles, close enough together to fill every voxel that they pass through."""
+    corners = surface.vertices[surface.triangles]
+    weights = np.array([[i, j, 4 - i - j] for i in range(5) for j in range(5 - i)]) / 4
+    return np.einsum("kc,tcd->tkd", weights, corners).reshape(-1, 3)
+
+
+def _blurred(filled: NDArray[np.float32], reach: int) -> NDArray[np.float32]:
+    """Mean over cubes of 2 reach + 1 voxels."""
+    out = filled
+    for axis in range(3):
+        padded = np.pad(out, [(reach + 1, reach) if a == axis else (0, 0) for a in range(3)], mode="edge")
+        total = np.cumsum(padded, axis=axis, dtype=np.float64)
+        upper = np.take(total, np.arange(2 * reach + 1, total.shape[axis]), axis=axis)
+        lower = np.take(total, np.arange(0, total.shape[axis] - 2 * reach - 1), axis=axis)
+        out = ((upper - lower) / (2 * reach + 1)).astype(np.float32)
+    return out
+
+
+def _open_sky(voxels: Voxels, points: Float, normals: Float) -> NDArray[np.float32]:
+    """How unobstructed the half space above each point is, 0 to 1."""
+    openness = np.ones(len(points), np.float32)
+    for reach, weight in ((1, 0.22), (2, 0.3), (4, 0.32), (7, 0.34)):
+        openness -= np.float32(weight) * voxels.fullness(points + normals * (reach + 0.6) * VOXEL_M, reach)
+    return np.clip(openness, 0.12, 1)
+
+
+def _from_lamp(voxels: Voxels, points: Float, normals: Float, position: Float, reach: float) -> NDArray[np.float32]:
+    """Light of a point source: falls off with distance and slant, shadowed softly."""
+    offset = position - points
+    square = (offset * offset).sum(axis=1)
+    slant = (offset * normals).sum(axis=1) / np.sqrt(square + 1e-6)
+    falloff = np.clip(slant * 0.8 + 0.2, 0, 1) / (1 + square / reach**2)
+    return (falloff * voxels.clear_view(points + normals * 1.6 * VOXEL_M, position)).astype(np.float32)
+
+
+def _windows(shell: Shell) -> list[tuple[Float, float]]:
+    """Points of light just inside each window and their strength."""
+    made = []
+    for hole in shell.openings:
+        if hole.kind != "window":
+            continue
+        wall, width = shell.walls[hole.wall], hole.right - hole.left
+        for share in (0.25, 0.75):
+            x, z = wall.point(hole.left + width * share, 0.3)
+            made.append((np.array([x, (hole.bottom + hole.top) / 2 + 0.2, z]), 0.3 * width))
+    return made
+
+
+def bake(shell: Shell, surfaces: list[Surface], lamps: list[Lamp]) -> list[NDArray[np.float32]]:
+    """`(v, 3)` colours in [0, 1] of each surface: tint times light.
+
+    Args:
+        shell: the room, whose windows give daylight.
+        surfaces: everything in the world frame.
+        lamps: in the world frame.
+    """
+    voxels = Voxels(shell, surfaces)
+    points = np.concatenate([surface.vertices for surface in surfaces])
+    normals = np.concatenate([surface.normals for surface in surfaces])
+    openness = _open_sky(voxels, points, normals)
+    ambient = openness * (0.62 + 0.06 * normals[:, 1]).astype(np.float32)
+    light = ambient[:, None] * np.array([1.0, 0.99, 0.97], np.float32)
+    for position, strength in _windows(shell):
+        daylight = _from_lamp(voxels, points, normals, position, 2.4) * np.float32(strength)
+        light += daylight[:, None] * np.array([0.97, 1.0, 1.04], np.float32)
+    for lamp in lamps:
+        warm = _from_lamp(voxels, points, normals, np.asarray(lamp.position), 0.9) * np.float32(lamp.strength)
+        light += warm[:, None] * np.array([1.05, 0.92, 0.7], np.float32)
+    light = np.where(light > 0.8, 0.8 + (light - 0.8) * 0.45, light)
+    colours, start = [], 0
+    for surface in surfaces:
+        end = start + len(surface.vertices)
+        shown = np.ones((end - start, 3), np.float32) if surface.material.glows else light[start:end]
+        colours.append(np.clip(shown * np.asarray(surface.material.tint, np.float32), 0, 1))
+        start = end
+    return colours

@@ -1,0 +1,81 @@
+"""Seamless noise and the few operations that every procedural picture is made of."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.scenes.builtin.dice import Dice
+
+Field = NDArray[np.float32]
+Colour = tuple[float, float, float]
+
+
+def _stretch(lattice: Field, length: int) -> Field:
+    """Rows of a periodic lattice, interpolated smoothly to `length` rows."""
+    rows = len(lattice)
+    position = np.arange(length, dtype=np.float32) * np.float32(rows / length)
+    index = position.astype(np.int64)
+    part = position - index
+    part = (part * part * (3 - 2 * part)).reshape(-1, *[1] * (lattice.ndim - 1))
+    return lattice[index % rows] * (1 - part) + lattice[(index + 1) % rows] * part
+
+
+def value_noise(dice: Dice, size: tuple[int, int], cells: tuple[int, int]) -> Field:
+    """`(height, width)` periodic noise in [0, 1] with `cells` (rows, columns) of random values."""
+    lattice = dice.array(cells)
+    return np.ascontiguousarray(_stretch(np.ascontiguousarray(_stretch(lattice, size[0]).T), size[1]).T)
+
+
+def fractal(dice: Dice, size: tuple[int, int], cells: tuple[int, int], octaves: int = 4, gain: float = 0.5) -> Field:
+    """`(height, width)` periodic sum of ever finer and weaker noise, in [0, 1]."""
+    total, weight, sum_of_weights = np.zeros(size, np.float32), 1.0, 0.0
+    rows, columns = cells
+    for _ in range(octaves):
+        total += np.float32(weight) * value_noise(dice, size, (min(rows, size[0]), min(columns, size[1])))
+        sum_of_weights += weight
+        rows, columns, weight = rows * 2, columns * 2, weight * gain
+    return total / np.float32(sum_of_weights)
+
+
+def coordinates(size: tuple[int, int]) -> tuple[Field, Field]:
+    """`(height, width)` each: u to the right and v downwards in (0, 1), at pixel centres."""
+    v, u = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float32)
+    return (u + np.float32(0.5)) / np.float32(size[1]), (v + np.float32(0.5)) / np.float32(size[0])
+
+
+def plain(size: tuple[int, int], colour: Colour) -> Field:
+    """`(height, width, 3)` of one colour."""
+    return np.broadcast_to(np.asarray(colour, np.float32), (*size, 3)).copy()
+
+
+def mix(first: Field, second: Colour | Field, share: Field | float) -> Field:
+    """Blend two colour fields; `share` (height, width) in [0, 1] is that of the second."""
+    share = np.asarray(share, np.float32)
+    share = share[..., None] if share.ndim == 2 else share
+    return first + (np.asarray(second, np.float32) - first) * share
+
+
+def shade(colour: Colour, factor: float) -> Colour:
+    """A lighter or darker colour, within [0, 1]."""
+    red, green, blue = (min(max(part * factor, 0.0), 1.0) for part in colour)
+    return red, green, blue
+
+
+def blend(first: Colour, second: Colour, share: float) -> Colour:
+    """The colour between two colours; `share` is that of the second."""
+    red, green, blue = (a + (b - a) * share for a, b in zip(first, second, strict=True))
+    return red, green, blue
+
+
+def step(value: Field, edge: float | Field, width: float) -> Field:
+    """0 below the edge, 1 above it, with a linear transition of the given width."""
+    return np.clip((value - np.float32(edge)) / np.float32(width) + np.float32(0.5), 0, 1)
+
+
+def wave(value: Field) -> Field:
+    """Triangle wave of period 1 in [0, 1]; 0 at whole numbers."""
+    return np.abs((value - np.floor(value)) * 2 - 1) * -1 + 1
+
+
+def to_picture(rgb: Field) -> NDArray[np.uint8]:
+    """`(height, width, 3)` colours in [0, 1] as bytes."""
+    return np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)

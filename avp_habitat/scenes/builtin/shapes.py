@@ -1,0 +1,271 @@
+"""Solids and sheets with texture coordinates in metres, normals outwards, counter-clockwise triangles."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Vector = tuple[float, float, float]
+Rectangle = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """A picture and how it lies on a surface."""
+
+    picture: NDArray[np.uint8]
+    """`(height, width, 3)` sRGB."""
+    width_m: float
+    """Metres that the picture spans along u."""
+    height_m: float
+    """Metres that the picture spans along v."""
+    tint: Vector = (1.0, 1.0, 1.0)
+    """Multiplies the picture."""
+    glows: bool = False
+    """Whether the surface shines by itself, so that baked light leaves it alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles of one material."""
+
+    vertices: Float
+    """`(v, 3)` metres."""
+    normals: Float
+    """`(v, 3)` unit length, outwards."""
+    uv: Float
+    """`(v, 2)` texture coordinates, v down."""
+    triangles: NDArray[np.int32]
+    """`(t, 3)` counter-clockwise as seen from outside."""
+    material: Material
+
+
+def _grid_triangles(rows: int, columns: int) -> NDArray[np.int32]:
+    """Triangles of a grid of vertices whose rows run down and whose columns run right, seen from the front."""
+    index = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    return np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], axis=2).reshape(-1, 3)
+
+
+def _unit(vectors: Float) -> Float:
+    length = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
+    return vectors / np.where(length < 1e-12, 1.0, length)
+
+
+def sheet(points: Float, uv: Float, material: Material, *, both_sides: bool = False) -> list[Surface]:
+    """A curved sheet through a grid of points.
+
+    Args:
+        points: `(rows, columns, 3)` metres; rows run down and columns right, seen from the front.
+        uv: `(rows, columns, 2)` texture coordinates.
+        material: of the sheet.
+        both_sides: add a back, 3 mm behind the front.
+    """
+    rows, columns = points.shape[:2]
+    vertices, triangles = points.reshape(-1, 3), _grid_triangles(rows, columns)
+    corners = vertices[triangles]
+    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, triangles[:, corner], face)
+    normals = _unit(normals)
+    front = Surface(vertices, normals, uv.reshape(-1, 2), triangles, material)
+    if not both_sides:
+        return [front]
+    back = replace(front, vertices=vertices - 0.003 * normals, normals=-normals, triangles=triangles[:, ::-1].copy())
+    return [front, back]
+
+
+def breaks(length: float, pitch: float, extra: tuple[float, ...] = ()) -> Float:
+    """Ascending positions from 0 to length no farther apart than pitch, with the extra ones among them."""
+    edges = sorted({0.0, length, *(place for place in extra if 0 < place < length)})
+    parts = [
+        np.linspace(start, end, max(1, int(np.ceil((end - start) / pitch - 1e-9))) + 1)[:-1]
+        for start, end in zip(edges[:-1], edges[1:], strict=True)
+    ]
+    return np.concatenate([*parts, [length]])
+
+
+def panel(
+    corner: Vector,
+    right: Vector,
+    down: Vector,
+    material: Material,
+    *,
+    pitch: float = 0.3,
+    fit: Rectangle | None = None,
+    turned: bool = False,
+    origin: tuple[float, float] = (0.0, 0.0),
+    holes: tuple[Rectangle, ...] = (),
+) -> Surface:
+    """A flat rectangle, subdivided so that light can vary over it.
+
+    Args:
+        corner: upper left corner as seen from the front, metres.
+        right: edge from the left to the right, metres.
+        down: edge from the upper to the lower side, metres.
+        material: of the rectangle.
+        pitch: largest distance between vertices in metres.
+        fit: texture rectangle (u0, v0, u1, v1) to stretch over it instead of measuring in metres.
+        turned: let u of the picture run downwards.
+        origin: metres along right and down at which the picture starts.
+        holes: rectangles (right0, down0, right1, down1) in metres that are left out.
+    """
+    start, across, fall = (np.asarray(part, dtype=np.float64) for part in (corner, right, down))
+    width, height = float(np.sqrt((across**2).sum())), float(np.sqrt((fall**2).sum()))
+    s = breaks(width, pitch, tuple(x for hole in holes for x in (hole[0], hole[2])))
+    t = breaks(height, pitch, tuple(y for hole in holes for y in (hole[1], hole[3])))
+    points = start + (s / width)[None, :, None] * across + (t / height)[:, None, None] * fall
+    uv = _panel_uv(s, t, width, height, material, fit, turned, origin)
+    triangles = _grid_triangles(len(t), len(s))
+    if holes:
+        mid_s, mid_t = (s[:-1] + s[1:]) / 2, (t[:-1] + t[1:]) / 2
+        open_ = np.zeros((len(mid_t), len(mid_s)), dtype=bool)
+        for left, top, end, bottom in holes:
+            open_ |= ((mid_t > top) & (mid_t < bottom))[:, None] & ((mid_s > left) & (mid_s < end))[None]
+        triangles = triangles[np.repeat(~open_.ravel(), 2)]
+    normal = _unit(np.cross(fall, across))
+    vertices = points.reshape(-1, 3)
+    return Surface(vertices, np.broadcast_to(normal, vertices.shape).copy(), uv, triangles, material)
+
+
+def _panel_uv(
+    s: Float,
+    t: Float,
+    width: float,
+    height: float,
+    material: Material,
+    fit: Rectangle | None,
+    turned: bool,
+    origin: tuple[float, float],
+) -> Float:
+    if fit is not None:
+        u, v = fit[0] + (fit[2] - fit[0]) * s / width, fit[1] + (fit[3] - fit[1]) * t / height
+        grid_v, grid_u = np.meshgrid(v, u, indexing="ij")
+    else:
+        grid_v, grid_u = np.meshgrid(t + origin[1], s + origin[0], indexing="ij")
+        if turned:
+            grid_u, grid_v = grid_v, grid_u
+        grid_u, grid_v = grid_u / material.width_m, grid_v / material.height_m
+    return np.stack([grid_u, grid_v], axis=-1).reshape(-1, 2)
+
+
+_FACES = {
+    "front": ((-1, 1, 1), 0, 1, 1, -1),
+    "back": ((1, 1, -1), 0, 1, -1, -1),
+    "right": ((1, 1, 1), 2, 1, -1, -1),
+    "left": ((-1, 1, -1), 2, 1, 1, -1),
+    "top": ((-1, 1, -1), 0, 2, 1, 1),
+    "bottom": ((-1, -1, 1), 0, 2, 1, -1),
+}
+"""Of each face: its upper left corner, the axes of right and down, and their signs."""
+
+ALL_FACES = tuple(_FACES)
+SIDES_AND_TOP = ("front", "back", "right", "left", "top")
+
+
+def box(
+    size: Vector,
+    centre: Vector,
+    material: Material,
+    *,
+    faces: tuple[str, ...] = ALL_FACES,
+    fit: Rectangle | None = None,
+    pitch: float = 0.35,
+) -> list[Surface]:
+    """A cuboid; the picture's u runs along its longest edge, as wood is cut.
+
+    Args:
+        size: extents along x, y, z in metres.
+        centre: its middle in metres.
+        material: of all faces.
+        faces: which faces to make, of front (+z), back, right (+x), left, top, bottom.
+        fit: texture rectangle to stretch over every face instead of measuring in metres.
+        pitch: largest distance between vertices in metres.
+    """
+    half, middle = np.asarray(size) / 2, np.asarray(centre, dtype=np.float64)
+    longest = int(np.argmax(np.round(size, 4)))
+    origin = (middle[0] * 1.7 + middle[1] * 2.9 + middle[2] * 1.3, middle[0] * 0.9 + middle[1] * 1.1 + middle[2] * 2.3)
+    made = []
+    for face in faces:
+        corner, right, down, right_sign, down_sign = _FACES[face]
+        across, fall = np.zeros(3), np.zeros(3)
+        across[right], fall[down] = right_sign * size[right], down_sign * size[down]
+        start = middle + half * corner
+        made.append(
+            panel(start, across, fall, material, pitch=pitch, fit=fit, turned=down == longest, origin=origin)  # type: ignore[arg-type]
+        )
+    return made
+
+
+def cushion(size: Vector, centre: Vector, radius: float, material: Material, *, puff: float = 0.0) -> list[Surface]:
+    """A cuboid with rounded edges; `puff` metres of bulge along its thinnest extent make a pillow."""
+    half, middle = np.asarray(size) / 2, np.asarray(centre, dtype=np.float64)
+    radius = min(radius, float(half.min()) * 0.98)
+    thin = int(np.argmin(np.round(size, 4)))
+    made = []
+    for corner, right, down, right_sign, down_sign in _FACES.values():
+        s, t = (
+            np.array([-half[a], -half[a] + radius, 0.0, half[a] - radius, half[a]]) * sign
+            for a, sign in ((right, right_sign), (down, down_sign))
+        )
+        points = np.zeros((5, 5, 3))
+        points[..., right], points[..., down] = s[None, :], t[:, None]
+        normal_axis = 3 - right - down
+        points[..., normal_axis] = half[normal_axis] * corner[normal_axis]
+        inner = np.clip(points, -(half - radius), half - radius)
+        points = inner + radius * _unit(points - inner)
+        if puff:
+            flat = np.delete(np.arange(3), thin)
+            share = 1 - np.clip(np.abs(points[..., flat] / half[flat]), 0, 1) ** 2
+            points[..., thin] += np.sign(points[..., thin]) * puff * share[..., 0] * share[..., 1]
+        uv = np.stack(np.broadcast_arrays(s[None, :] / material.width_m, t[:, None] / material.height_m), axis=-1)
+        uv = uv * [right_sign, down_sign] + [middle[0] * 1.3 + middle[2], middle[1] + middle[2] * 0.7]
+        made += sheet(points + middle, uv, material)
+    return made
+
+
+def lathe(
+    profile: list[tuple[float, float]], centre: Vector, material: Material, *, segments: int = 12, squash: float = 1.0
+) -> list[Surface]:
+    """A surface of revolution about a vertical axis.
+
+    Args:
+        profile: (radius, height) in metres from the top of the outside downwards.
+        centre: foot of the axis in metres.
+        material: of the surface.
+        segments: faces around.
+        squash: scale of the extent along z.
+    """
+    outline = np.asarray(profile, dtype=np.float64)
+    angle = np.arange(segments + 1) * (2 * np.pi / segments)
+    points = np.empty((len(outline), segments + 1, 3))
+    points[..., 0] = outline[:, :1] * np.sin(angle) + centre[0]
+    points[..., 1] = outline[:, 1:] + centre[1]
+    points[..., 2] = outline[:, :1] * np.cos(angle) * squash + centre[2]
+    path = np.concatenate([[0.0], np.cumsum(np.sqrt((np.diff(outline, axis=0) ** 2).sum(axis=1)))])
+    turns = max(1, round(2 * np.pi * float(outline[:, 0].max()) / material.width_m))
+    u, v = np.meshgrid(angle / (2 * np.pi) * turns, path / material.height_m)
+    return sheet(points, np.stack([u, v], axis=-1), material)
+
+
+def cylinder(
+    radius: float, bottom: float, top: float, centre: Vector, material: Material, segments: int = 12
+) -> list[Surface]:
+    """An upright cylinder with sharp rims between two heights above its foot, metres."""
+    lid = lathe([(0.0005, top), (radius, top)], centre, material, segments=segments)
+    side = lathe([(radius, top), ((radius), bottom)], centre, material, segments=segments)
+    base = lathe([(radius, bottom), (0.0005, bottom)], centre, material, segments=segments)
+    return lid + side + base
+
+
+def moved(surfaces: list[Surface], axes: Float, offset: Float) -> list[Surface]:
+    """The same surfaces turned by `axes` (3, 3), whose columns are the new x, y and z, then shifted by `offset`."""
+    return [replace(s, vertices=s.vertices @ axes.T + offset, normals=s.normals @ axes.T) for s in surfaces]
+
+
+def yawed(surfaces: list[Surface], yaw: float, offset: Vector = (0.0, 0.0, 0.0)) -> list[Surface]:
+    """The same surfaces turned about +Y by `yaw` radians, then shifted."""
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    return moved(surfaces, np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]), np.asarray(offset))
