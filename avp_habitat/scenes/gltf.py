@@ -1,6 +1,5 @@
 """Reads glTF 2.0 (`.glb`, `.gltf`) into one TexturedMesh."""
 
-import json
 import math
 import struct
 import warnings
@@ -201,9 +200,12 @@ def _parse(content: bytes) -> pygltflib.GLTF2:
             declared = struct.unpack_from("<I", content, 8)[0]
             if declared > len(content):
                 raise ValueError(f"truncated: the header announces {declared} bytes, found {len(content)}")
-            return pygltflib.GLTF2.load_from_bytes(content)
-        json.loads(content.decode("utf-8"))
-        return pygltflib.GLTF2.gltf_from_json(content.decode("utf-8"))
+            document = pygltflib.GLTF2.load_from_bytes(content)
+        else:
+            document = pygltflib.GLTF2.gltf_from_json(content.decode("utf-8-sig"))
+    if document is None:
+        raise ValueError("no JSON chunk")
+    return document
 
 
 def _local_transform(node: pygltflib.Node) -> NDArray:

@@ -90,9 +90,9 @@ def _check(mesh: TexturedMesh, path: Path) -> None:
     if not len(mesh.triangles):
         raise SceneError(f"{path}: expected a mesh with triangles, found none")
     for name, values in (("position", mesh.vertices), ("texture coordinate", mesh.uv), ("colour", mesh.colours)):
-        wrong = ~np.isfinite(values).all(axis=1)
-        if wrong.any():
+        wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if len(wrong):
             raise SceneError(
-                f"{path}: expected finite numbers, but {int(wrong.sum())} of {len(wrong)} vertices have a {name} that "
-                f"is NaN or infinite (the first is vertex {int(wrong.argmax())})"
+                f"{path}: expected finite numbers, but {len(wrong)} of {len(values)} vertices have a {name} that "
+                f"is NaN or infinite (the first is vertex {wrong[0]})"
             )

@@ -2,7 +2,7 @@
 
 import io
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -55,7 +55,7 @@ def _silenced(name: str) -> Iterator[None]:
         logger.disabled = before
 
 
-class _References:
+class _References(Mapping[str, bytes]):
     """Hands referenced files to trimesh, and keeps what went wrong, which trimesh only writes to its log."""
 
     def __init__(self, files: SceneFiles, *, library_first: bool) -> None:
@@ -64,7 +64,7 @@ class _References:
         self._failure: SceneError | None = None
         self._pictures: list[NDArray[np.uint8]] = []
 
-    def get(self, name: str) -> bytes:
+    def __getitem__(self, name: str) -> bytes:
         """Content of the referenced file; every one but an OBJ's material library must be a picture."""
         try:
             content = self._files.read(name)
@@ -76,7 +76,13 @@ class _References:
             self._failure = self._failure or failure
             raise
 
-    __getitem__ = get
+    def __iter__(self) -> Iterator[str]:
+        """No names: files are only read when asked for."""
+        return iter(())
+
+    def __len__(self) -> int:
+        """No names: files are only read when asked for."""
+        return 0
 
     def raise_failure(self) -> None:
         """Raise the first error that trimesh swallowed."""
@@ -109,12 +115,13 @@ def _textured(
     light: NDArray[np.float32],
     references: _References,
 ) -> TexturedMesh:
-    """Texture times diffuse colour times vertex colour, as the MTL format defines it; v points upwards in these formats."""
+    """Texture times diffuse colour times vertex colour, as the MTL format defines it; v points upwards here."""
     image = getattr(visual.material, "image", None)
     uv = np.zeros((len(vertices), 2), np.float32)
     textured = image is not None and visual.uv is not None
     if textured:
-        uv = np.stack([visual.uv[:, 0], 1.0 - visual.uv[:, 1]], axis=1).astype(np.float32)
+        u, v = np.asarray(visual.uv).T
+        uv = np.stack([u, 1.0 - v], axis=1).astype(np.float32)
     diffuse = getattr(visual.material, "kwargs", {}).get("kd", [1.0, 1.0, 1.0])
     colours = np.clip(light * np.array(diffuse, np.float32), 0, 1)
     index = np.full(len(triangles), 0 if textured else -1, np.int32)

@@ -128,7 +128,7 @@ class RaycastSimulator:
         reached[far] = ~self._rays.blocked(rays)
         return reached
 
-    def surface_below(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+    def surface_below(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
         """Height of the first surface straight below each point.
 
         Args:
@@ -140,7 +140,9 @@ class RaycastSimulator:
         points = np.asarray(points, dtype=np.float64)
         rays = np.concatenate([points, np.broadcast_to([0.0, -1.0, 0.0], points.shape)], axis=1).astype(np.float32)
         distance = self._rays.cast(rays)["t_hit"].astype(np.float64)
-        return np.where(np.isfinite(distance), points[:, 1] - distance, np.nan)
+        height = points[:, 1] - distance
+        height[~np.isfinite(distance)] = np.nan
+        return height
 
     def close(self) -> None:
         """Free nothing: the memory goes with the object."""
