@@ -20,6 +20,7 @@ from avp_habitat.simulators.base import Simulator
 from avp_habitat.trajectory import Trajectory
 
 Float = NDArray[np.floating]
+_PART_COLUMNS = tuple(f"part {name}" for name in PARTS)
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class ViewpointTask:
         self._angles = np.zeros((agents, budget + 1, 2))
         self._log = {
             name: np.zeros((agents, budget))
-            for name in ("action", "reward", "coverage", "collided", "redundant", *PARTS)
+            for name in ("action", "reward", "coverage", "collided", "redundant", *_PART_COLUMNS)
         }
         self._cell_index = np.full(area.mask.shape, -1, dtype=np.int64)
         self._cell_index[area.mask] = np.arange(self._cells)
@@ -150,7 +151,7 @@ class ViewpointTask:
             camera_to_world=self._sensor_poses(position, yaw, pitch),
             action=log["action"].astype(np.int64),
             reward=log["reward"],
-            reward_parts={name: log[name] for name in PARTS},
+            reward_parts={name: log[f"part {name}"] for name in PARTS},
             coverage=log["coverage"],
             collided=log["collided"].astype(np.bool_),
             redundant=log["redundant"].astype(np.bool_),
@@ -267,7 +268,7 @@ class ViewpointTask:
             "coverage": facts.coverage,
             "collided": facts.collided,
             "redundant": facts.redundant,
-            **parts,
+            **{f"part {name}": values for name, values in parts.items()},
         }
         for name, values in columns.items():
             self._log[name][np.arange(self.agents), self.steps - 1] = values

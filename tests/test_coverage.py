@@ -63,14 +63,14 @@ def test_depth_images_agree_with_occlusion_rays_at_any_resolution(width, height)
 
 
 def test_far_floor_is_seen_in_a_coarse_depth_image():
-    # Rows of a 12 pixel high image lie metres apart on the far floor: a nearest-pixel comparison would lose it.
+    # Rows of a 12 pixel high image lie up to 1.4 m apart on this floor: a nearest-pixel comparison would lose half.
     camera = Intrinsics.from_hfov(16, 12, hfov_deg=90)
     pose = poses.camera_to_world(np.array([[0.3, 1.5, 2.5]]), yaw=np.array([-np.pi / 2]), pitch=np.array([0.0]))
-    points = np.stack([np.linspace(2.2, 5.8, 40), np.zeros(40), np.full(40, 2.4)], axis=1)
+    points = np.stack([np.linspace(2.5, 5.0, 40), np.zeros(40), np.full(40, 2.4)], axis=1)
     pairs = candidates(pose, camera, points, np.ones((1, 40), dtype=bool), max_range_m=10.0)
     depth = SIMULATOR.render(pose, camera, rgb=False).depth
     assert len(pairs) == 40
-    assert visible_in_depth(pose, camera, depth, points, pairs, tolerance_m=TOLERANCE).mean() > 0.9
+    assert visible_in_depth(pose, camera, depth, points, pairs, tolerance_m=TOLERANCE).all()
 
 
 def test_cells_passed_over_equal_dense_sampling_along_every_ray():

@@ -150,7 +150,7 @@ def test_three_agents_at_once_do_what_one_does_by_hand(reward):
     assert bool(met["stop"]) == (reward == "proposed")
 
 
-def run_one(task, actions, position=(1.0, 0.0, 1.5), yaw=0.0):
+def run_one(task, actions, position=(1.0, 0.0, 1.5), yaw=-1.2):
     task.reset([0], np.array([position]), np.array([yaw]))
     return [task.step(np.array([action])) for action in actions]
 
@@ -178,7 +178,7 @@ def test_stop_without_enough_coverage_costs_and_goes_on():
 
 
 def test_stop_with_enough_coverage_terminates_with_the_saved_steps_rewarded():
-    easy = dataclasses.replace(SETTINGS, constants=RewardConstants(stop_coverage=0.02))
+    easy = dataclasses.replace(SETTINGS, constants=RewardConstants(stop_coverage=0.002))
     outcomes = run_one(ViewpointTask(SIMULATOR, easy, agents=1), [LOOK_DOWN, STOP])
     assert outcomes[1].terminated.tolist() == [True]
     assert not outcomes[1].truncated[0]
@@ -226,6 +226,9 @@ def test_the_trajectory_and_its_figures_belong_together():
     assert figures["coverage"] == pytest.approx(np.count_nonzero(trajectory.first_seen) / len(AREA.centres))
     assert figures["ei"] == pytest.approx(figures["coverage"] / 5)
     assert figures["path_length_m"] == pytest.approx(0.75)
+    np.testing.assert_allclose(trajectory.coverage, [o.facts.coverage[0] for o in outcomes])
+    for name in PARTS:
+        np.testing.assert_allclose(trajectory.reward_parts[name], [o.parts[name][0] for o in outcomes])
     assert sum(figures[f"return_{name}"] for name in PARTS) == pytest.approx(sum(o.reward[0] for o in outcomes))
     np.testing.assert_allclose(trajectory.camera_to_world[:, 1, 3], 1.5)
 
