@@ -1,0 +1,1 @@
+"""Where agents can stand and how they move, from a triangle mesh."""

@@ -3,12 +3,17 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.navigation.settings import NavigationSettings
 from avp_habitat.scenes.mesh import TexturedMesh
+
+if TYPE_CHECKING:
+    from avp_habitat.navigation.geodesic import Roadmap
+    from avp_habitat.navigation.walls import Walls
 
 Float = NDArray[np.float64]
 SurfaceBelow = Callable[[Float], NDArray[np.floating]]
@@ -96,11 +101,13 @@ class NavigableArea:
             ValueError: an agent starts outside of the area, or a number is not finite.
         """
         from avp_habitat.navigation.motion import slide
+        from avp_habitat.navigation.walls import are_inside
 
         begin, move = _on_plane(positions), _on_plane(displacements)
         if not (np.isfinite(begin).all() and np.isfinite(move).all()):
             raise ValueError("expected finite positions and displacements, got NaN or infinity")
-        outside = np.flatnonzero(~self.contains(positions))
+        begin = self._pulled_inside(begin)
+        outside = np.flatnonzero(~are_inside(self._walls, begin))
         if len(outside):
             raise ValueError(
                 f"expected agents over the navigable area; {len(outside)} of {len(begin)} are outside, "
@@ -141,11 +148,19 @@ class NavigableArea:
 
     def _walks(self, start: Float, goals: Float) -> tuple[Float, NDArray, NDArray]:
         from avp_habitat.navigation.geodesic import distances
+        from avp_habitat.navigation.walls import are_inside, off_walls
 
-        begin, ends = _on_plane(np.asarray(start)[None]), _on_plane(goals)
+        begin, ends = (off_walls(self._walls, _on_plane(points)) for points in (np.asarray(start)[None], goals))
         length, last, before = distances(self._walls, self._roadmap, begin[0], ends)
-        reachable = self.contains(np.asarray(goals)) & self.contains(np.asarray(start)[None])
+        reachable = are_inside(self._walls, ends) & are_inside(self._walls, begin)
         return np.where(reachable, length, np.inf), last, before
+
+    def _pulled_inside(self, on_plane: Float) -> Float:
+        """The same `(n, 2)` points; those on the outline or within the skin outside of it are moved inside."""
+        from avp_habitat.navigation.walls import are_inside, off_walls
+
+        inside = are_inside(self._walls, on_plane)
+        return on_plane if inside.all() else np.where(inside[:, None], on_plane, off_walls(self._walls, on_plane))
 
     def _on_floor(self, on_plane: Float) -> Float:
         points = np.stack([on_plane[:, 0], np.zeros(len(on_plane)), on_plane[:, 1]], axis=1)
@@ -153,20 +168,20 @@ class NavigableArea:
         return points
 
     @cached_property
-    def _walls(self):  # noqa: ANN202
+    def _walls(self) -> "Walls":
         from avp_habitat.navigation.walls import make_walls
 
         return make_walls(list(self.rings))
 
     @cached_property
-    def _roadmap(self):  # noqa: ANN202
+    def _roadmap(self) -> "Roadmap":
         from avp_habitat.navigation.geodesic import make_roadmap
 
         return make_roadmap(self._walls, list(self.rings))
 
 
 def _on_plane(points: Float) -> Float:
-    """x and z of `(n, 3)` points."""
+    """Floor-plane coordinates x, z of `(n, 3)` points."""
     return np.ascontiguousarray(np.asarray(points, dtype=np.float64)[:, [0, 2]])
 
 

@@ -6,11 +6,11 @@ from numpy.typing import NDArray
 from avp_habitat.errors import SceneError
 from avp_habitat.navigation.area import Float, NavigableArea, SurfaceBelow
 from avp_habitat.navigation.boundary import outline
-from avp_habitat.navigation.filters import StandingPlaces, standing_places
-from avp_habitat.navigation.heightfield import level_triangles, voxelise
-from avp_habitat.navigation.parts import Part, connected_parts, lay_flat, main_part, part_near
+from avp_habitat.navigation.filters import standing_places
+from avp_habitat.navigation.heightfield import Heightfield, level_triangles, voxelise
+from avp_habitat.navigation.parts import Part, common_place, connected_parts, lay_flat, main_part, place_near
 from avp_habitat.navigation.settings import NavigationSettings
-from avp_habitat.navigation.walls import SKIN_M, are_inside, make_walls
+from avp_habitat.navigation.walls import SKIN_M, Walls, are_inside, make_walls, off_walls
 from avp_habitat.scenes.mesh import TexturedMesh
 
 _REACH_CELLS = 8
@@ -28,8 +28,11 @@ def build(
     part = connected_parts(places, settings.radius_voxels, settings.region_min_size**2)
     if not (part >= 0).any():
         raise SceneError(_no_place(vertices, settings))
-    chosen = main_part(places, part) if start is None else _part_at(places, part, start, field, settings)
-    flat = lay_flat(places, part == chosen, field.shape)
+    if start is None:
+        seed = common_place(places, part, main_part(places, part))
+    else:
+        seed = place_near(places, part, field.shape[1], _voxel_of(start, field, settings))
+    flat = lay_flat(places, part, seed, field.shape)
     rings = [
         field.origin[[0, 2]].astype(np.float64) + ring * settings.voxel_m
         for ring in outline(flat.inside, settings.edge_max_error)
@@ -73,13 +76,10 @@ def _no_place(vertices: NDArray[np.float32], settings: NavigationSettings) -> st
     )
 
 
-def _part_at(places: StandingPlaces, part: NDArray, start: NDArray, field, settings: NavigationSettings) -> int:
-    column, level, row = (np.asarray(start, dtype=np.float64) - field.origin) / [
-        settings.voxel_m,
-        settings.voxel_height_m,
-        settings.voxel_m,
-    ]
-    return part_near(places, part, field.shape[1], int(row), int(column), float(level))
+def _voxel_of(point: NDArray, field: Heightfield, settings: NavigationSettings) -> tuple[float, float, float]:
+    """Row, column and level of a `(3,)` point in metres."""
+    x, y, z = np.asarray(point, dtype=np.float64) - field.origin
+    return z // settings.voxel_m, x // settings.voxel_m, y / settings.voxel_height_m
 
 
 def _with_floor(
@@ -93,7 +93,7 @@ def _with_floor(
     x = origin[0] + (np.arange(columns) + 0.5) * cell
     z = origin[1] + (np.arange(rows) + 0.5) * cell
     centres = np.stack(np.meshgrid(x, z), axis=-1)
-    mask = are_inside(make_walls(rings), centres.reshape(-1, 2)).reshape(rows, columns)
+    mask = _stands_clear(make_walls(rings), centres.reshape(-1, 2)).reshape(rows, columns)
     if not mask.any():
         raise SceneError(f"the navigable area is smaller than one cell of {cell:g} m; is the scene not in metres?")
     voxel_floor = np.where(flat.inside, low[1] + flat.floor * settings.voxel_height_m, np.nan)
@@ -110,6 +110,11 @@ def _with_floor(
     return NavigableArea(
         cell, origin, mask, np.where(np.isfinite(heights), heights, np.nanmedian(heights)), tuple(rings)
     )
+
+
+def _stands_clear(walls: Walls, points: Float) -> NDArray[np.bool_]:
+    """`(n,)` whether `(n, 2)` points are inside and not on a wall, where an agent could not stand."""
+    return are_inside(walls, points) & (off_walls(walls, points) == points).all(axis=1)
 
 
 def continued(heights: Float, reach: int, choose: np.ufunc) -> Float:

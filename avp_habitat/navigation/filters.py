@@ -1,6 +1,7 @@
 """Which tops of solid spans an agent can stand on and step between, by Recast's rules.
 
-Directions are numbered 0: -X, 1: +Z, 2: +X, 3: -Z. Source: M. Mononen, Recast Navigation (filters, compact heightfield).
+Directions are numbered 0: -X, 1: +Z, 2: +X, 3: -Z. Source: M. Mononen, Recast Navigation 1.6.0 (filters, compact
+heightfield).
 """
 
 from dataclasses import dataclass
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 from avp_habitat.navigation.heightfield import Heightfield
 from avp_habitat.navigation.settings import NavigationSettings
 
-_SKY = 0xFFFF
+SKY = 0xFFFF
+"""Ceiling of a place that has none."""
 STEP_X = np.array([-1, 0, 1, 0])
 STEP_Z = np.array([0, 1, 0, -1])
 
@@ -46,7 +48,7 @@ def standing_places(field: Heightfield, settings: NavigationSettings) -> Standin
 
 @njit(cache=True)
 def _ceilings(first, bottom):
-    ceiling = np.full(len(bottom), _SKY, np.int32)
+    ceiling = np.full(len(bottom), SKY, np.int32)
     for column in range(len(first) - 1):
         for i in range(first[column], first[column + 1] - 1):
             ceiling[i] = bottom[i + 1]
@@ -73,7 +75,7 @@ def _column_beside(column, direction, shape):
 
 
 @njit(cache=True)
-def _drop_beside(first, bottom, top, ceiling, i, beside, height, climb):  # noqa: PLR0913
+def _drop_beside(first, bottom, top, ceiling, i, beside, height, climb):
     """Lowest and highest floor of a neighbouring column that an agent fits through to, relative to span i.
 
     Only floors within the climb count for the highest; a fall into the void counts as one voxel more than the climb.
@@ -81,7 +83,7 @@ def _drop_beside(first, bottom, top, ceiling, i, beside, height, climb):  # noqa
     the version in Habitat-Sim).
     """
     start, end = first[beside], first[beside + 1]
-    above = bottom[start] if end > start else _SKY
+    above = bottom[start] if end > start else SKY
     if min(ceiling[i], above) - top[i] > height:
         return -climb - 1, 0
     lowest = highest = 0
@@ -95,7 +97,7 @@ def _drop_beside(first, bottom, top, ceiling, i, beside, height, climb):  # noqa
 
 
 @njit(cache=True)
-def _is_ledge(first, bottom, top, ceiling, shape, column, i, height, climb):  # noqa: PLR0913
+def _is_ledge(first, bottom, top, ceiling, shape, column, i, height, climb):
     """Whether a span is beside a drop of more than the climb, or on a slope whose neighbours differ by more."""
     lowest = highest = 0
     for direction in range(4):
@@ -108,7 +110,7 @@ def _is_ledge(first, bottom, top, ceiling, shape, column, i, height, climb):  # 
 
 
 @njit(cache=True)
-def _ledges(first, bottom, top, ceiling, walkable, shape, height, climb):  # noqa: PLR0913
+def _ledges(first, bottom, top, ceiling, walkable, shape, height, climb):
     ledge = np.zeros(len(top), np.bool_)
     for column in range(len(first) - 1):
         for i in range(first[column], first[column + 1]):
@@ -118,7 +120,7 @@ def _ledges(first, bottom, top, ceiling, walkable, shape, height, climb):  # noq
 
 
 @njit(cache=True)
-def _neighbours(first, floor, ceiling, shape, height, climb):  # noqa: PLR0913
+def _neighbours(first, floor, ceiling, shape, height, climb):
     neighbour = np.full((len(floor), 4), -1, np.int64)
     for column in range(len(first) - 1):
         for i in range(first[column], first[column + 1]):

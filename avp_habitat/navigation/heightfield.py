@@ -73,7 +73,7 @@ def voxelise(vertices: NDArray[np.float32], triangles: NDArray[np.int32], settin
 
 
 @njit(cache=True)
-def _cut(polygon, count, axis, limit, below, above):  # noqa: PLR0913
+def _cut(polygon, count, axis, limit, below, above):
     """Cut a convex polygon at a coordinate; returns the numbers of vertices below and above."""
     low = high = 0
     for i in range(count):
@@ -101,7 +101,7 @@ def _grown(array):
 
 
 @njit(cache=True)
-def _insert(head, pool, state, column, low, high, walkable, climb):  # noqa: PLR0913
+def _insert(head, pool, state, column, low, high, walkable, climb):
     """Add a span to a column's linked list, melting it with those that it touches.
 
     `pool` rows are (bottom, top, walkable, next); `state` is (first free row of the pool or -1, rows ever used).
@@ -162,41 +162,47 @@ def _extent(polygon, count, axis, origin, per_metre, cells):
 
 
 @njit(cache=True)
-def _rasterise(vertices, triangles, level_enough, low, high, cell, level, rows, columns, climb):  # noqa: PLR0913
+def _rasterise(vertices, triangles, level_enough, low, high, cell, level, rows, columns, climb):
     head = np.full(rows * columns, -1, np.int64)
     pool = np.empty((max(1024, rows * columns), 4), np.int64)
     state = np.array([-1, 0])
-    rest, row, piece, spare = (
-        np.empty((12, 3), np.float32),
-        np.empty((12, 3), np.float32),
-        np.empty((12, 3), np.float32),
-        np.empty((12, 3), np.float32),
-    )
+    rest, row, spare = np.empty((12, 3), np.float32), np.empty((12, 3), np.float32), np.empty((12, 3), np.float32)
+    piece = np.empty((12, 3), np.float32)
     per_metre = np.float32(1) / cell
     for t in range(len(triangles)):
         for k in range(3):
             rest[k] = vertices[triangles[t, k]]
         left = 3
-        start_z, end_z = _extent(rest, 3, 2, low[2], per_metre, rows)
-        for z in range(start_z, end_z + 1):
-            limit_z = low[2] + np.float32(z) * cell + cell
-            in_row, left = _cut(rest, left, 2, limit_z, row, spare)
+        start, end = _extent(rest, 3, 2, low[2], per_metre, rows)
+        for z in range(start, end + 1):
+            limit = low[2] + np.float32(z) * cell + cell
+            in_row, left = _cut(rest, left, 2, limit, row, spare)
             rest, spare = spare, rest
-            if in_row < 3 or z < 0:
-                continue
-            start_x, end_x = _extent(row, in_row, 0, low[0], per_metre, columns)
-            for x in range(start_x, end_x + 1):
-                limit_x = low[0] + np.float32(x) * cell + cell
-                count, in_row = _cut(row, in_row, 0, limit_x, piece, spare)
-                row, spare = spare, row
-                if count < 3 or x < 0:
-                    continue
-                bottom, top = _voxel_range(piece, count, low[1], high[1], level)
-                if top > bottom:
-                    if state[0] < 0 and state[1] == len(pool):
-                        pool = _grown(pool)
-                    _insert(head, pool, state, z * columns + x, bottom, top, np.int64(level_enough[t]), climb)
+            if in_row >= 3 and z >= 0:
+                column_heads = head[z * columns : (z + 1) * columns]
+                walkable = np.int64(level_enough[t])
+                pool = _fill_row(
+                    column_heads, pool, state, row, in_row, piece, spare, low, high, cell, level, walkable, climb
+                )
     return _flattened(head, pool)
+
+
+@njit(cache=True)
+def _fill_row(head, pool, state, row, in_row, piece, spare, low, high, cell, level, walkable, climb):
+    """Cut a triangle's piece in one row of columns into columns; returns the pool, which may have moved."""
+    start, end = _extent(row, in_row, 0, low[0], np.float32(1) / cell, len(head))
+    for x in range(start, end + 1):
+        limit = low[0] + np.float32(x) * cell + cell
+        count, in_row = _cut(row, in_row, 0, limit, piece, spare)
+        row, spare = spare, row
+        if count < 3 or x < 0:
+            continue
+        bottom, top = _voxel_range(piece, count, low[1], high[1], level)
+        if top > bottom:
+            if state[0] < 0 and state[1] == len(pool):
+                pool = _grown(pool)
+            _insert(head, pool, state, x, bottom, top, walkable, climb)
+    return pool
 
 
 @njit(cache=True)

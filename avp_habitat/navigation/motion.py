@@ -53,7 +53,7 @@ def _slide_all(walls, positions, displacements):
 
 
 @njit(cache=True)
-def _first_contact(ends, walls, x, z, dx, dz):  # noqa: PLR0913
+def _first_contact(ends, walls, x, z, dx, dz):
     """Share of the displacement up to the first contact (1 for none) and the contact's normal."""
     first, normal_x, normal_z = 1.0, 0.0, 0.0
     for k in walls:
@@ -71,7 +71,7 @@ def _first_contact(ends, walls, x, z, dx, dz):  # noqa: PLR0913
 
 
 @njit(cache=True)
-def _wall_contact(ax, az, bx, bz, x, z, dx, dz):  # noqa: PLR0913
+def _wall_contact(ax, az, bx, bz, x, z, dx, dz):
     """Contact with the straight of a wall: only from its inner side, only when moving towards it."""
     length = np.hypot(bx - ax, bz - az)
     ux, uz = (bx - ax) / length, (bz - az) / length
@@ -86,7 +86,7 @@ def _wall_contact(ax, az, bx, bz, x, z, dx, dz):  # noqa: PLR0913
 
 
 @njit(cache=True)
-def _corner_contact(cx, cz, x, z, dx, dz):  # noqa: PLR0913
+def _corner_contact(cx, cz, x, z, dx, dz):
     """Contact with the circle of the skin's radius around a corner: only when moving towards it."""
     off_x, off_z = x - cx, z - cz
     towards = off_x * dx + off_z * dz

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from avp_habitat.navigation.filters import _SKY, StandingPlaces
+from avp_habitat.navigation.filters import SKY, StandingPlaces
 
 _FAR = 255
 
@@ -51,35 +51,37 @@ def main_part(places: StandingPlaces, part: NDArray[np.int64]) -> int:
 
 def _is_roof(places: StandingPlaces, part: NDArray[np.int64], candidate: int, count: int) -> bool:
     own = part == candidate
-    if np.mean(places.ceiling[own] == _SKY) < 0.5:
+    if np.mean(places.ceiling[own] == SKY) < 0.5:
         return False
-    height = dict(zip(places.column[own].tolist(), places.floor[own].tolist(), strict=True))
-    others = np.flatnonzero((part >= 0) & ~own)
-    covered = np.zeros(count)
-    for i in others:
-        covered[part[i]] += places.floor[i] < height.get(int(places.column[i]), -1)
+    height = np.full(int(places.column.max()) + 1, -1, np.int32)
+    height[places.column[own]] = places.floor[own]
+    others = (part >= 0) & ~own
+    beneath = others & (places.floor < height[places.column])
     sizes = np.bincount(part[others], minlength=count)
-    return bool((covered > 0.5 * np.maximum(sizes, 1)).any())
+    return bool((np.bincount(part[beneath], minlength=count) > 0.5 * np.maximum(sizes, 1)).any())
 
 
-def part_near(
-    places: StandingPlaces, part: NDArray[np.int64], columns: int, row: int, column: int, floor: float
-) -> int:
-    """The part whose place is nearest to a voxel column and a height in voxels; height counts like distance."""
+def place_near(places: StandingPlaces, part: NDArray[np.int64], columns: int, voxel: tuple[float, float, float]) -> int:
+    """Index of the place of any part nearest to a voxel (row, column, level); height counts like distance."""
     candidates = np.flatnonzero(part >= 0)
-    rows_off = places.column[candidates] // columns - row
-    columns_off = places.column[candidates] % columns - column
-    floors_off = places.floor[candidates] - floor
-    return int(part[candidates[np.argmin(rows_off**2 + columns_off**2 + floors_off**2)]])
+    row, column, level = voxel
+    off = (places.column[candidates] // columns - row) ** 2 + (places.column[candidates] % columns - column) ** 2
+    return int(candidates[np.argmin(off + (places.floor[candidates] - level) ** 2)])
 
 
-def lay_flat(places: StandingPlaces, own: NDArray[np.bool_], shape: tuple[int, int]) -> Part:
-    """A part as a picture; of storeys that lie over each other, the one with the first place is kept.
+def common_place(places: StandingPlaces, part: NDArray[np.int64], chosen: int) -> int:
+    """Index of the first place of a part on its most common level."""
+    own = np.flatnonzero(part == chosen)
+    return int(own[places.floor[own] == np.bincount(places.floor[own]).argmax()][0])
 
-    Storeys are peeled apart breadth-first along steps, so that the picture is one sheet on which neighbouring columns
-    are a step apart.
+
+def lay_flat(places: StandingPlaces, part: NDArray[np.int64], seed: int, shape: tuple[int, int]) -> Part:
+    """The part that holds place `seed`, as a picture; of storeys that lie over each other the nearest one is kept.
+
+    Storeys are peeled apart breadth-first along steps from the seed, so that the picture is one sheet on which
+    neighbouring columns are a step apart.
     """
-    inside, floor = _sheet(places.column, places.floor, places.neighbour, own, shape)
+    inside, floor = _sheet(places.column, places.floor, places.neighbour, part == part[seed], seed, shape)
     return Part(inside, floor)
 
 
@@ -130,25 +132,21 @@ def _flood(neighbour, keep):
 
 
 @njit(cache=True)
-def _sheet(column, floor, neighbour, own, shape):
-    """Breadth-first from the middle place of the part; a column is taken once, beside columns that it has a step to."""
+def _sheet(column, floor, neighbour, own, seed, shape):
+    """Breadth-first from a place; a column is taken once, and only beside columns that it has a step to."""
     rows, columns = shape
     place = np.full(rows * columns, -1, np.int64)
     queue = np.empty(len(own), np.int64)
-    begin = end = 0
-    for i in range(len(own)):
-        if own[i]:
-            place[column[i]], queue[0], end = i, i, 1
-            break
+    place[column[seed]], queue[0] = seed, seed
+    begin, end = 0, 1
     while begin < end:
         i = queue[begin]
         begin += 1
         for beside in neighbour[i]:
-            if beside >= 0 and own[beside] and place[column[beside]] < 0:
-                if _fits(place, column, neighbour, beside, columns):
-                    place[column[beside]] = beside
-                    queue[end] = beside
-                    end += 1
+            free = beside >= 0 and own[beside] and place[column[beside]] < 0
+            if free and _fits(place, column, neighbour, beside, columns):
+                place[column[beside]], queue[end] = beside, beside
+                end += 1
     inside, height = np.zeros((rows, columns), np.bool_), np.zeros((rows, columns), np.int32)
     for k in range(end):
         i = queue[k]

@@ -51,7 +51,7 @@ def _rows(az, bz, origin, bin_m, rows):
 
 
 @njit(cache=True)
-def _columns(ax, az, bx, bz, row, origin, bin_m, columns):  # noqa: PLR0913
+def _columns(ax, az, bx, bz, row, origin, bin_m, columns):
     """First and last column of bins that the part of a segment in a row passes through, the skin included."""
     low, high = origin[1] + row * bin_m - 2 * SKIN_M, origin[1] + (row + 1) * bin_m + 2 * SKIN_M
     begin, end = 0.0, 1.0
@@ -89,7 +89,7 @@ def _fill_bins(ends, origin, bin_m, shape):
 
 
 @njit(cache=True)
-def near_line(walls, ax, az, bx, bz, seen, ticket, found):  # noqa: PLR0913
+def near_line(walls, ax, az, bx, bz, seen, ticket, found):
     """Collect the walls within the skin of a line (and some farther ones), each once.
 
     `seen` `(k,)` holds the last ticket of each wall, `found` `(k,)` takes their indices; returns how many.
@@ -138,3 +138,39 @@ def are_inside(walls, points):
     for i in range(len(points)):
         result[i] = is_inside(walls, points[i, 0], points[i, 1])
     return result
+
+
+@njit(cache=True)
+def off_walls(walls, points):
+    """The same `(n, 2)` points, those closer to a wall than the skin moved to its inner side."""
+    result = points.copy()
+    seen, found = np.zeros(len(walls.ends), np.int64), np.empty(len(walls.ends), np.int64)
+    ticket = 0
+    for i in range(len(points)):
+        for _ in range(4):
+            ticket += 1
+            x, z = result[i]
+            count = near_line(walls, x, z, x, z, seen, ticket, found)
+            moved = False
+            for k in found[:count]:
+                moved |= _push(walls.ends[k], result[i])
+            if not moved:
+                break
+    return result
+
+
+@njit(cache=True)
+def _push(wall, point):
+    """Move a point away from a wall that is closer than the skin; returns whether it was."""
+    ax, az, bx, bz = wall
+    length = np.hypot(bx - ax, bz - az)
+    ux, uz = (bx - ax) / length, (bz - az) / length
+    along = min(max((point[0] - ax) * ux + (point[1] - az) * uz, 0.0), length)
+    off_x, off_z = point[0] - ax - along * ux, point[1] - az - along * uz
+    distance = np.hypot(off_x, off_z)
+    if distance >= SKIN_M * (1 - 1e-9):
+        return False
+    if distance == 0 or 0 < along < length:
+        off_x, off_z, distance = -uz, ux, 1.0
+    point[0], point[1] = ax + along * ux + SKIN_M * off_x / distance, az + along * uz + SKIN_M * off_z / distance
+    return True
