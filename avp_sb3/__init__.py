@@ -1,4 +1,4 @@
-"""Callbacks of the suite for Stable-Baselines3, imported when they are first named."""
+"""The batched environment and the callbacks for Stable-Baselines3, imported when they are first named."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -7,10 +7,12 @@ if TYPE_CHECKING:
     from avp_sb3.metrics_callback import MetricsCallback
     from avp_sb3.mlflow_callback import MLflowCallback
     from avp_sb3.rerun_callback import RerunCallback
+    from avp_sb3.vec_env import AVPVecEnv
 
-__all__ = ["MLflowCallback", "MetricsCallback", "RerunCallback"]
+__all__ = ["AVPVecEnv", "MLflowCallback", "MetricsCallback", "RerunCallback"]
 
 _HOME = {
+    "AVPVecEnv": "avp_sb3.vec_env",
     "MetricsCallback": "avp_sb3.metrics_callback",
     "MLflowCallback": "avp_sb3.mlflow_callback",
     "RerunCallback": "avp_sb3.rerun_callback",
