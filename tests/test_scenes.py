@@ -1,4 +1,5 @@
 import base64
+import hashlib
 import io
 import json
 import struct
@@ -401,6 +402,21 @@ def test_an_obj_has_textures_times_diffuse_colours_with_v_downwards(tmp_path):
     assert np.array_equal(mesh.textures[0], PICTURE)
 
 
+def test_a_third_texture_coordinate_of_an_obj_is_ignored(tmp_path):
+    (tmp_path / "map.png").write_bytes(png(PICTURE))
+    spec = obj(tmp_path, "newmtl wood\nmap_Kd map.png\nnewmtl plain\n")
+    (tmp_path / "room.obj").write_text("\n".join(f"{x} 9" if x.startswith("vt") else x for x in OBJ.split("\n")))
+    mesh = load_scene(spec).mesh
+    assert 0 in mesh.texture_index
+    assert mesh.uv.max() == 1
+
+
+def test_an_obj_with_flat_vertices_is_refused(tmp_path):
+    (tmp_path / "flat.obj").write_text("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n")
+    with pytest.raises(SceneError, match=r"flat.obj: expected three coordinates for every vertex"):
+        load_scene(str(tmp_path / "flat.obj"))
+
+
 def test_the_digest_of_an_obj_covers_its_library_and_pictures(tmp_path):
     digests = set()
     for colour, pixels in (("0.5", PICTURE), ("0.6", PICTURE), ("0.6", PICTURE[::-1])):
@@ -492,3 +508,12 @@ def test_the_white_room_has_its_baked_light(shared):
     assert len(scene.mesh.triangles) == 767934
     assert len(scene.mesh.textures) == 13
     assert 0.4 < scene.mesh.colours.mean() < 0.95
+
+
+def test_a_generated_room_is_named_by_its_seed_and_generator():
+    from avp_habitat.scenes.builtin import GENERATOR_VERSION
+
+    scene = load_scene("builtin:007")
+    assert scene.name == "builtin:7"
+    assert scene.digest == hashlib.sha256(f"builtin:7:v{GENERATOR_VERSION}".encode()).hexdigest()
+    assert len(scene.mesh.triangles) > 100

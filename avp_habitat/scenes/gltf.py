@@ -18,7 +18,17 @@ from avp_habitat.scenes.mesh import TexturedMesh, merge
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 # What walking through a document raises where a field is missing, of another type or out of range.
-_MALFORMED = (AttributeError, IndexError, KeyError, TypeError, ValueError, OSError, RecursionError, struct.error)
+_MALFORMED = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RecursionError,
+    TypeError,
+    ValueError,
+    struct.error,
+)
 _SUPPORTED = {
     "EXT_texture_webp",
     "KHR_lights_punctual",

@@ -98,6 +98,8 @@ class _References(Mapping[str, bytes]):
 def _part(geometry: Any, files: SceneFiles, references: _References) -> TexturedMesh:
     vertices = np.asarray(geometry.vertices, np.float32)
     triangles = np.asarray(geometry.faces, np.int32)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise SceneError(f"{files.path}: expected three coordinates for every vertex, got shape {vertices.shape}")
     if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
         raise SceneError(
             f"{files.path}: a face names vertices {triangles.min()} to {triangles.max()} of {len(vertices)}"
@@ -118,10 +120,10 @@ def _textured(
     """Texture times diffuse colour times vertex colour, as the MTL format defines it; v points upwards here."""
     image = getattr(visual.material, "image", None)
     uv = np.zeros((len(vertices), 2), np.float32)
-    textured = image is not None and visual.uv is not None
+    stored = np.zeros((0, 2)) if visual.uv is None else np.asarray(visual.uv)
+    textured = image is not None and len(stored) == len(vertices) and stored.shape[1] >= 2
     if textured:
-        u, v = np.asarray(visual.uv).T
-        uv = np.stack([u, 1.0 - v], axis=1).astype(np.float32)
+        uv = np.stack([stored[:, 0], 1.0 - stored[:, 1]], axis=1).astype(np.float32)
     diffuse = getattr(visual.material, "kwargs", {}).get("kd", [1.0, 1.0, 1.0])
     colours = np.clip(light * np.array(diffuse, np.float32), 0, 1)
     index = np.full(len(triangles), 0 if textured else -1, np.int32)

@@ -149,7 +149,7 @@ class RaycastSimulator:
 
 
 @lru_cache(maxsize=8)
-def _pixel_columns(intrinsics: Intrinsics) -> NDArray[np.float64]:
+def _pixel_columns(intrinsics: Intrinsics) -> NDArray[np.floating]:
     """`(3, pixels)` camera-frame directions, one contiguous row per axis."""
     return np.ascontiguousarray(pixel_directions(intrinsics).reshape(-1, 3).T)
 
