@@ -1,20 +1,22 @@
 """An output format of Stable-Baselines3's logger that writes to an MLflow run."""
 
 import re
+import threading
 import time
 import warnings
-from collections import deque
+from dataclasses import dataclass
 from numbers import Real
+from queue import SimpleQueue
 from typing import Any
 
 from mlflow import MlflowClient
 from mlflow.entities import Metric, RunTag
-from mlflow.exceptions import MlflowException
 from stable_baselines3.common.logger import KVWriter
 
 FORMAT = "mlflow"
 """The name by which `logger.record(..., exclude="mlflow")` keeps a value away from MLflow."""
 _UNSAFE = re.compile(r"[^\w.\- /]")
+_MAX_NAME, _MAX_TAG = 250, 5000
 
 
 def safe_name(name: str) -> str:
@@ -24,11 +26,25 @@ def safe_name(name: str) -> str:
     MLflow would resolve like a file path, go.
     """
     parts = (part for part in _UNSAFE.sub("_", name).split("/") if part not in ("", ".", ".."))
-    return "/".join(parts)[:250].rstrip("/") or "_"
+    return "/".join(parts)[:_MAX_NAME].rstrip("/") or "_"
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """What one dump of the logger leaves for MLflow."""
+
+    metrics: list[Metric]
+    """Numbers."""
+    tags: list[RunTag]
+    """Texts."""
 
 
 class MLflowWriter(KVWriter):
-    """Sends what the logger dumps to a run, in the background; a failing server costs a warning, not the training."""
+    """Sends what the logger dumps to a run in the background; a failing server costs a warning, not the training.
+
+    It has a thread of its own because the pool of MLflow's asynchronous logging is gone when Python's exit handlers
+    run, which is when the metrics of an interrupted training have to be stored.
+    """
 
     def __init__(self, client: MlflowClient, run_id: str) -> None:
         """Write to a run.
@@ -39,46 +55,54 @@ class MLflowWriter(KVWriter):
         """
         self._client = client
         self._run_id = run_id
-        self._pending: deque[Any] = deque()
+        self._queue: SimpleQueue[_Batch | None] = SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._error: Exception | None = None
         self._warned: set[str] = set()
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
         """Queue numbers as metrics at `step` (environment steps) and texts as tags; other kinds are named once."""
         now = int(time.time() * 1000)
-        metrics, tags = [], []
+        batch = _Batch([], [])
         for key, value in key_values.items():
             if FORMAT in (key_excluded.get(key) or ()):
                 continue
             if isinstance(value, str):
-                tags.append(RunTag(safe_name(key), value[:5000]))
+                batch.tags.append(RunTag(safe_name(key), value[:_MAX_TAG]))
             elif (number := _number(value)) is not None:
-                metrics.append(Metric(safe_name(key), number, now, step))
+                batch.metrics.append(Metric(safe_name(key), number, now, step))
             else:
                 self._warn_once(key, f"{key}: MLflow takes numbers and texts here, not {type(value).__name__}")
-        if metrics or tags:
-            self._send(metrics, tags)
+        if batch.metrics or batch.tags:
+            self._start()
+            self._queue.put(batch)
 
     def flush(self) -> None:
-        """Wait until everything queued is stored."""
-        while self._pending:
-            self._settle(self._pending.popleft())
+        """Wait until everything queued is stored; what could not be stored is a warning."""
+        if self._thread is not None:
+            self._queue.put(None)
+            self._thread.join()
+            self._thread = None
+        if self._error is not None:
+            error, self._error = self._error, None
+            self._warn_once("", f"MLflow run {self._run_id}: some metrics were not stored: {error}")
 
     def close(self) -> None:
         """Flush."""
         self.flush()
 
-    def _send(self, metrics: list[Metric], tags: list[RunTag]) -> None:
-        while self._pending and all(future.done() for future in self._pending[0]._operation_futures):
-            self._settle(self._pending.popleft())
-        operation = self._client.log_batch(self._run_id, metrics=metrics, tags=tags, synchronous=False)
-        if operation is not None:
-            self._pending.append(operation)
+    def _start(self) -> None:
+        if self._thread is None:
+            # A daemon, so that an interpreter that exits without a flush is not held up.
+            self._thread = threading.Thread(target=self._send_all, name="avp-mlflow", daemon=True)
+            self._thread.start()
 
-    def _settle(self, operation: Any) -> None:
-        try:
-            operation.wait()
-        except MlflowException as error:
-            self._warn_once("", f"MLflow run {self._run_id}: some metrics were not stored: {error}")
+    def _send_all(self) -> None:
+        while (batch := self._queue.get()) is not None:
+            try:
+                self._client.log_batch(self._run_id, metrics=batch.metrics, tags=batch.tags)
+            except Exception as error:
+                self._error = error
 
     def _warn_once(self, key: str, text: str) -> None:
         if key not in self._warned:

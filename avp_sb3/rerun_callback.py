@@ -15,9 +15,7 @@ from avp_sb3.rerun_episode import EncodedView, encode_view, episode_of, log_epis
 from avp_sb3.rerun_recording import open_recording
 
 if TYPE_CHECKING:
-    import rerun as rr
     from avp_habitat.navigation.area import NavigableArea
-
     from avp_habitat.trajectory import Trajectory
 
 DEFAULT_FOLDER = Path("runs")

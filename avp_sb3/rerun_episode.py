@@ -25,7 +25,6 @@ from avp_habitat.poses import Intrinsics
 
 if TYPE_CHECKING:
     from avp_habitat.navigation.area import NavigableArea
-
     from avp_habitat.trajectory import Trajectory
 
 UNSEEN, SEEN = 0, 1

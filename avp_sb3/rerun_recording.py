@@ -3,6 +3,7 @@
 import csv
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -108,7 +109,8 @@ def write_rollout_recording(folders: Sequence[Path], target: Path) -> Path:
     except OSError as error:
         raise RolloutError(f"{target}: cannot write there: {error.strerror or error}") from None
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
     return target
 
 
@@ -143,10 +145,11 @@ class _Steps:
 
     def actions(self) -> NDArray[np.float64]:
         """`(t,)` the actions' numbers."""
-        try:
-            return np.array([float(ACTION_NAMES.index(row["action"])) for row in self.rows])
-        except (KeyError, ValueError) as error:
-            raise RolloutError(f"{self.path}: expected actions out of {', '.join(ACTION_NAMES)}: {error}") from None
+        unknown = {row.get("action") for row in self.rows} - set(ACTION_NAMES)
+        if unknown:
+            found = ", ".join(sorted(map(repr, unknown)))
+            raise RolloutError(f"{self.path}: expected actions out of {', '.join(ACTION_NAMES)}, found {found}")
+        return np.array([float(ACTION_NAMES.index(row["action"])) for row in self.rows])
 
 
 def _read_steps(rollout: Rollout) -> _Steps:
