@@ -4,12 +4,13 @@ import numpy as np
 
 from avp_habitat.errors import UsageError
 from avp_habitat.scenes.builtin.dice import Dice
+from avp_habitat.scenes.builtin.floorplan import Placed
 from avp_habitat.scenes.builtin.kit import Kit
-from avp_habitat.scenes.builtin.layout import Placed, furnish
+from avp_habitat.scenes.builtin.layout import furnish
 from avp_habitat.scenes.builtin.lighting import bake
 from avp_habitat.scenes.builtin.masonry import build_shell
 from avp_habitat.scenes.builtin.piece import Lamp
-from avp_habitat.scenes.builtin.shapes import Surface
+from avp_habitat.scenes.builtin.shapes import Surface, joined
 from avp_habitat.scenes.builtin.shell import Shell, plan_shell
 from avp_habitat.scenes.mesh import TexturedMesh, merge
 
@@ -73,5 +74,6 @@ def generate_room(seed: int) -> TexturedMesh:
     for stand in placed:
         surfaces += stand.surfaces()
         lamps += [_in_world(stand, lamp) for lamp in stand.piece.lamps]
+    surfaces = joined(surfaces)
     colours = bake(shell, surfaces, lamps)
     return merge([_mesh(surface, colour) for surface, colour in zip(surfaces, colours, strict=True)])

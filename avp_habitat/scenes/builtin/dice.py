@@ -41,6 +41,10 @@ class Dice:
         """One of the options, with equal odds."""
         return options[self.whole(0, len(options) - 1)]
 
+    def child(self) -> "Dice":
+        """Another stream, so that what is drawn from it, or not, changes nothing here."""
+        return Dice(self.whole(0, 1 << 40))
+
     def shuffled(self, options: Sequence[Choice]) -> list[Choice]:
         """The options in random order (Fisher-Yates)."""
         order = list(options)

@@ -86,6 +86,15 @@ def parquet(dice: Dice, colour: Colour) -> Picture:
     return to_picture(rgb)
 
 
+def paint(dice: Dice, colour: Colour) -> Picture:
+    """Brushed paint on wood, strokes along u, 1.2 m x 0.6 m."""
+    size = (192, 384)
+    strokes = fractal(dice, size, (64, 5), 2, 0.8)
+    chips = step(value_noise(dice, size, (64, 128)), 0.93, 0.05)
+    light = 0.94 + 0.12 * (strokes - 0.5) + 0.08 * (fractal(dice, size, (6, 6), 4) - 0.5) - 0.1 * chips
+    return to_picture(plain(size, colour) * light[..., None])
+
+
 def marble(dice: Dice, colour: Colour, vein: Colour) -> Picture:
     """A polished slab with veins, 1.2 m x 1.2 m."""
     size = (384, 384)
@@ -135,8 +144,9 @@ def plaster(dice: Dice, colour: Colour) -> Picture:
     broad = fractal(dice, size, (4, 4), 4)
     strokes = fractal(dice, size, (40, 10), 3, 0.7)
     crossed = fractal(dice, size, (9, 36), 3, 0.7)
-    specks = step(value_noise(dice, size, (150, 150)), 0.86, 0.1)
-    light = 0.92 + 0.14 * (broad - 0.5) + 0.3 * (strokes - 0.5) + 0.24 * (crossed - 0.5) - 0.13 * specks
+    grit = value_noise(dice, size, (200, 200))
+    specks = 0.06 * step(grit, 0.9, 0.1) - 0.09 * step(-grit, -0.1, 0.1)
+    light = 0.955 + 0.07 * (broad - 0.5) + 0.13 * (strokes - 0.5) + 0.1 * (crossed - 0.5) + specks
     return to_picture(plain(size, colour) * light[..., None])
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 from avp_habitat.scenes.builtin import decor, seating, storage, tables
 from avp_habitat.scenes.builtin.dice import Dice
@@ -51,33 +52,37 @@ def against_wall(piece: Piece, clear: float) -> Arrange:
     return lambda depth: group if depth > front + clear else None
 
 
-def living(kit: Kit, dice: Dice) -> Arrange:
-    """A television and a sofa that faces it over a coffee table on a rug, with armchair, side table and lamp."""
+def living(kit: Kit, dice: Dice) -> list[Arrange]:
+    """A television and a sofa that faces it over a coffee table on a rug; the fullest arrangement comes first."""
     unit, couch = storage.television(kit, dice), seating.sofa(kit, dice)
     table, carpet = tables.coffee_table(kit, dice), decor.rug(kit, 2.3, 1.6)
     seat, beside, lamp = seating.armchair(kit, dice), tables.side_table(kit, dice), decor.floor_lamp(kit, dice)
     side, twist = dice.pick((-1, 1)), dice.number(-0.2, 0.2)
     free = dice.number(3.3, 3.8)
 
-    def arrange(depth: float) -> Group | None:
-        if depth < 3.1:
-            return None
-        back = depth - GAP_M if depth < 4.4 else min(free, depth)
+    seat_x = side * max(couch.width / 2 + 0.15, table.width / 2 + 0.16 + seat.depth * 0.6)
+
+    def members(back: float) -> list[Member]:
         sofa_z = back - couch.depth / 2
         table_z = sofa_z - couch.depth / 2 - 0.42 - table.depth / 2
-        members = [
+        return [
             Member(unit, 0.0, GAP_M + unit.depth / 2),
             Member(couch, 0.0, sofa_z, 2),
             Member(table, 0.0, table_z),
             Member(carpet, 0.0, table_z + 0.1),
             Member(beside, -side * (couch.width / 2 + 0.26), sofa_z - 0.16, 2),
+            Member(lamp, side * (couch.width / 2 + 0.25), sofa_z + 0.2),
+            Member(seat, seat_x, table_z - 0.12, 3 if side > 0 else 1, twist),
         ]
-        if back > 3.0:
-            members.append(Member(seat, side * (couch.width / 2 + 0.15), table_z - 0.12, 3 if side > 0 else 1, twist))
-            members.append(Member(lamp, side * (couch.width / 2 + 0.25), sofa_z + 0.2))
-        return Group(tuple(members), ((-0.6, 0.5, 0.6, table_z - table.depth / 2),))
 
-    return arrange
+    def arrange(depth: float, count: int) -> Group | None:
+        if depth < (3.1 if count > 5 else 2.95):
+            return None
+        back = depth - GAP_M if depth < 4.4 else min(free, depth)
+        chosen = members(back)[:count]
+        return Group(tuple(chosen), ((-0.6, 0.5, 0.6, chosen[2].z - table.depth / 2),))
+
+    return [lambda depth, count=count: arrange(depth, count) for count in (7, 6, 5, 4)]
 
 
 def dining(kit: Kit, dice: Dice) -> Arrange:
@@ -150,24 +155,23 @@ def reading(kit: Kit, dice: Dice) -> Arrange:
     return lambda depth: group if depth > 2.2 else None
 
 
-def divider(kit: Kit, dice: Dice, ceiling: float) -> Arrange:
-    """A partition wall or a double shelf that runs from a wall into the room and hides what is behind it."""
+def divider(kit: Kit, dice: Dice, ceiling: float) -> list[Arrange]:
+    """A partition wall or double shelf that runs from a wall into the room to hide what is behind it, longest first."""
     masonry = dice.chance(0.5)
     wall = dice.pick((kit.feature_wall, kit.papered_wall))
-    share = dice.number(0.4, 0.52)
-    shelf_dice = Dice(dice.whole(0, 1 << 30))
+    lengths = (2.3, 1.9, 1.5, 1.2)
+    gap, dice = (-0.02, dice.child()) if masonry else (GAP_M, dice.child())
 
-    def arrange(depth: float) -> Group | None:
-        length = round(min(depth * share, 2.4), 2)
-        if length < 1.1 or depth - length < 1.2:
+    @cache
+    def piece(length: float) -> Piece:
+        return partition(kit, dice, wall, length, ceiling) if masonry else storage.divider_shelf(kit, dice, length)
+
+    def arrange(depth: float, length: float) -> Group | None:
+        if depth - length < 1.1 or length > 0.62 * depth:
             return None
-        if masonry:
-            piece = partition(kit, Dice(7), wall, length, ceiling)
-            return Group((Member(piece, 0.0, length / 2, 1),))
-        piece = storage.divider_shelf(kit, shelf_dice, length)
-        return Group((Member(piece, 0.0, GAP_M + length / 2, 1),))
+        return Group((Member(piece(length), 0.0, gap + length / 2, 1),))
 
-    return arrange
+    return [lambda depth, length=length: arrange(depth, length) for length in lengths]
 
 
 def partition(kit: Kit, dice: Dice, material: Material, length: float, ceiling: float) -> Piece:
@@ -178,9 +182,9 @@ def partition(kit: Kit, dice: Dice, material: Material, length: float, ceiling: 
     )
     made += box((length, ceiling, thick), (0, ceiling / 2, 0), kit.trim, faces=("left", "right"), pitch=0.25)
     made += box(
-        (length + 0.02, 0.09, thick + 0.03), (0, 0.045, 0), kit.trim, faces=("front", "back", "left", "right", "top")
+        (length - 0.002, 0.09, thick + 0.03), (0, 0.045, 0), kit.trim, faces=("front", "back", "left", "right", "top")
     )
     wide = min(length - 0.5, dice.number(0.6, 0.9))
     front = shifted(decor.picture(kit, dice, wide, 0.62), 0, 1.55, thick / 2)
     back = yawed(shifted(decor.picture(kit, dice, wide * 0.8, 0.7), 0, 1.55, thick / 2), 3.14159265)
-    return Piece("partition", made + front + back, length + 0.02, thick + 0.07, ceiling)
+    return Piece("partition", made + front + back, length, thick + 0.07, ceiling)

@@ -115,7 +115,7 @@ class Kit:
     @cached_property
     def trim(self) -> Material:
         """White paint of frames, doors and skirting."""
-        return Material(finishes.wood(self._dice(6), (0.93, 0.93, 0.91)), 1.2, 0.6)
+        return Material(finishes.paint(self._dice(6), (0.96, 0.96, 0.94)), 1.2, 0.6)
 
     @cached_property
     def wood(self) -> Material:
@@ -225,7 +225,12 @@ class Kit:
     @cached_property
     def television(self) -> Material:
         """A film on the television."""
-        return Material(pictures.painting(self._dice(56), self.colours, wide=True), 1.0, 1.0, glows=True)
+        return Material(pictures.film(self._dice(56), self.colours), 1.0, 1.0, glows=True)
+
+    @cached_property
+    def keys(self) -> Material:
+        """A keyboard."""
+        return Material(pictures.keys(self._dice(57)), 1.0, 1.0)
 
     def _next(self) -> Dice:
         self._count += 1

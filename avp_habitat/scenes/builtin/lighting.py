@@ -94,7 +94,7 @@ def _open_sky(voxels: Voxels, points: Float, normals: Float) -> NDArray[np.float
     openness = np.ones(len(points), np.float32)
     for reach, weight in ((1, 0.22), (2, 0.3), (4, 0.32), (7, 0.34)):
         openness -= np.float32(weight) * voxels.fullness(points + normals * (reach + 0.6) * VOXEL_M, reach)
-    return np.clip(openness, 0.12, 1)
+    return np.clip(openness, 0.3, 1)
 
 
 def _from_lamp(voxels: Voxels, points: Float, normals: Float, position: Float, reach: float) -> NDArray[np.float32]:
@@ -131,7 +131,7 @@ def bake(shell: Shell, surfaces: list[Surface], lamps: list[Lamp]) -> list[NDArr
     points = np.concatenate([surface.vertices for surface in surfaces])
     normals = np.concatenate([surface.normals for surface in surfaces])
     openness = _open_sky(voxels, points, normals)
-    ambient = openness * (0.62 + 0.06 * normals[:, 1]).astype(np.float32)
+    ambient = openness * (0.76 + 0.05 * normals[:, 1]).astype(np.float32)
     light = ambient[:, None] * np.array([1.0, 0.99, 0.97], np.float32)
     for position, strength in _windows(shell):
         daylight = _from_lamp(voxels, points, normals, position, 2.4) * np.float32(strength)

@@ -50,10 +50,10 @@ def _blocks(dice: Dice, size: tuple[int, int], colours: list[Colour]) -> Field:
     u, v = coordinates(size)
     rgb = plain(size, blend(colours[0], (1, 1, 1), 0.6))
     for _ in range(22):
-        left, top = dice.number(-0.1, 0.9), dice.number(-0.1, 0.9)
-        wide, high = dice.number(0.05, 0.4), dice.number(0.05, 0.4)
-        inside = (u > left) & (u < left + wide) & (v > top) & (v < top + high)
-        rgb = mix(rgb, dice.pick(colours), inside.astype(np.float32) * dice.number(0.5, 1.0))
+        left, top = int(dice.number(0.0, 0.9) * size[1]), int(dice.number(0.0, 0.9) * size[0])
+        wide, high = int(dice.number(0.05, 0.4) * size[1]), int(dice.number(0.05, 0.4) * size[0])
+        part = rgb[top : top + high, left : left + wide]
+        part[...] = mix(part, dice.pick(colours), dice.number(0.5, 1.0))
     for _ in range(5):
         line = np.minimum(np.abs(u - dice.number(0.05, 0.95)), np.abs(v - dice.number(0.05, 0.95)))
         rgb = mix(rgb, (0.1, 0.1, 0.12), step(-line, -0.008, 0.006))
@@ -139,6 +139,24 @@ def screen(dice: Dice, colours: list[Colour]) -> Picture:
         text = inside & (v > top + 0.09) & (wave(v * 26) > 0.5) & words & (u > left + 0.03) & (u < right - 0.04)
         rgb = mix(rgb, (0.2, 0.22, 0.26), text * np.float32(0.85))
     return to_picture(rgb)
+
+
+def film(dice: Dice, colours: list[Colour]) -> Picture:
+    """A landscape on a television, with a line of subtitles; spans the whole screen."""
+    size = (216, 384)
+    u, v = coordinates(size)
+    words = (value_noise(dice, size, (108, 90)) > 0.42) & (np.abs(v - 0.9) < 0.025) & (np.abs(u - 0.5) < 0.3)
+    return to_picture(mix(_hills(dice, size, colours), (1, 1, 1), words.astype(np.float32)))
+
+
+def keys(dice: Dice) -> Picture:
+    """A keyboard with light letters; spans the whole keyboard."""
+    size = (96, 288)
+    u, v = coordinates(size)
+    key = (wave(u * 15) > 0.16) & (wave(v * 5) > 0.18)
+    letters = key & (wave(u * 15) > 0.6) & (wave(v * 5) > 0.5) & (value_noise(dice, size, (48, 96)) > 0.45)
+    rgb = mix(plain(size, (0.2, 0.2, 0.22)), (0.36, 0.36, 0.39), key.astype(np.float32))
+    return to_picture(mix(rgb, (0.92, 0.92, 0.9), letters.astype(np.float32)))
 
 
 def spine_cell(index: int) -> tuple[float, float, float, float]:

@@ -3,7 +3,7 @@
 from avp_habitat.scenes.builtin.dice import Dice
 from avp_habitat.scenes.builtin.kit import Kit
 from avp_habitat.scenes.builtin.piece import Piece, shifted
-from avp_habitat.scenes.builtin.shapes import Material, Surface, box, cushion, cylinder, yawed
+from avp_habitat.scenes.builtin.shapes import Material, Surface, box, cushion, cylinder, leaned, yawed
 
 SEAT_M = 0.46
 """Seats are higher than an agent with quantised steps of 0.2 m can climb."""
@@ -17,11 +17,11 @@ def _legs(width: float, depth: float, height: float, side: float, material: Mate
     return made
 
 
-def _pillow(kit: Kit, dice: Dice, x: float, y: float, z: float) -> list[Surface]:
+def _pillow(kit: Kit, dice: Dice, x: float, y: float, z: float, lean: float = -0.3) -> list[Surface]:
+    """A loose pillow that leans back; (x, y, z) is where its lower edge rests."""
     side = dice.number(0.36, 0.46)
-    made = cushion((side, side, 0.1), (0, 0, 0), 0.05, dice.pick(kit.cushions), puff=0.03)
-    tilted = yawed(made, dice.number(-0.25, 0.25))
-    return shifted(tilted, x, y + side / 2, z)
+    made = shifted(cushion((side, side, 0.1), (0, 0, 0), 0.05, dice.pick(kit.cushions), puff=0.03), 0, side / 2, 0)
+    return yawed(leaned(made, lean), dice.number(-0.25, 0.25), (x, y, z))
 
 
 def _padded(kit: Kit, dice: Dice, width: float, seats: int, cloth: Material, kind: str) -> Piece:
@@ -42,7 +42,7 @@ def _padded(kit: Kit, dice: Dice, width: float, seats: int, cloth: Material, kin
     places = [-1, 1] if seats > 1 else [0]
     for side in places:
         x = side * (width / 2 - arm - 0.26)
-        made += _pillow(kit, dice, x, 0.47, -depth / 2 + back + 0.24)
+        made += _pillow(kit, dice, x, 0.47, -depth / 2 + back + 0.3)
     return Piece(kind, made, width, depth, max(high, 0.95))
 
 
@@ -108,5 +108,5 @@ def bed(kit: Kit, dice: Dice) -> Piece:
     for index in range(count):
         x = 0.0 if count == 1 else (index - 0.5) * width * 0.48
         made += cushion((0.62, 0.13, 0.4), (x, 0.57, -depth / 2 + 0.34), 0.06, kit.linen, puff=0.03)
-    made += _pillow(kit, dice, 0.0, 0.56, -depth / 2 + 0.6)
+    made += _pillow(kit, dice, 0.0, 0.62, -depth / 2 + 0.62, -0.95)
     return Piece("bed", made, width, depth, high)

@@ -1,6 +1,7 @@
 """Solids and sheets with texture coordinates in metres, normals outwards, counter-clockwise triangles."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,15 +83,15 @@ def breaks(length: float, pitch: float, extra: tuple[float, ...] = ()) -> Float:
     edges = sorted({0.0, length, *(place for place in extra if 0 < place < length)})
     parts = [
         np.linspace(start, end, max(1, int(np.ceil((end - start) / pitch - 1e-9))) + 1)[:-1]
-        for start, end in zip(edges[:-1], edges[1:], strict=True)
+        for start, end in pairwise(edges)
     ]
     return np.concatenate([*parts, [length]])
 
 
 def panel(
-    corner: Vector,
-    right: Vector,
-    down: Vector,
+    corner: Vector | Float,
+    right: Vector | Float,
+    down: Vector | Float,
     material: Material,
     *,
     pitch: float = 0.3,
@@ -165,6 +166,46 @@ ALL_FACES = tuple(_FACES)
 SIDES_AND_TOP = ("front", "back", "right", "left", "top")
 
 
+def _face_corners(face: str) -> NDArray[np.int64]:
+    """`(4, 3)` signs of a face's upper left, lower left, lower right and upper right corner."""
+    corner, right, down, _, _ = _FACES[face]
+    signs = np.tile(np.array(corner), (4, 1))
+    signs[1:3, down] *= -1
+    signs[2:4, right] *= -1
+    return signs
+
+
+_CORNERS = {face: _face_corners(face) for face in _FACES}
+_QUAD = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+_UNIT_QUAD = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]])
+
+
+def _small_box(
+    size: Float, middle: Float, material: Material, faces: tuple[str, ...], fit: Rectangle | None
+) -> Surface:
+    """A cuboid of one quad per face."""
+    vertices = middle + size / 2 * np.concatenate([_CORNERS[face] for face in faces])
+    normals, uv = np.zeros_like(vertices), np.empty((len(vertices), 2))
+    longest, origin = int(np.argmax(np.round(size, 4))), _picture_origin(middle)
+    for index, face in enumerate(faces):
+        corner, right, down, _, _ = _FACES[face]
+        rows = slice(4 * index, 4 * index + 4)
+        normals[rows, 3 - right - down] = corner[3 - right - down]
+        if fit is not None:
+            uv[rows] = _UNIT_QUAD * [fit[2] - fit[0], fit[3] - fit[1]] + fit[:2]
+            continue
+        metres = _UNIT_QUAD * [size[right], size[down]] + origin
+        uv[rows] = (metres[:, ::-1] if down == longest else metres) / [material.width_m, material.height_m]
+    triangles = (_QUAD[None] + 4 * np.arange(len(faces), dtype=np.int32)[:, None, None]).reshape(-1, 3)
+    return Surface(vertices, normals, uv, triangles, material)
+
+
+def _picture_origin(middle: Float) -> tuple[float, float]:
+    """Where on its picture a box starts, so that neighbouring boards differ."""
+    x, y, z = (float(part) for part in middle)
+    return x * 1.7 + y * 2.9 + z * 1.3, x * 0.9 + y * 1.1 + z * 2.3
+
+
 def box(
     size: Vector,
     centre: Vector,
@@ -184,18 +225,18 @@ def box(
         fit: texture rectangle to stretch over every face instead of measuring in metres.
         pitch: largest distance between vertices in metres.
     """
-    half, middle = np.asarray(size) / 2, np.asarray(centre, dtype=np.float64)
-    longest = int(np.argmax(np.round(size, 4)))
-    origin = (middle[0] * 1.7 + middle[1] * 2.9 + middle[2] * 1.3, middle[0] * 0.9 + middle[1] * 1.1 + middle[2] * 2.3)
+    extent, middle = np.asarray(size, dtype=np.float64), np.asarray(centre, dtype=np.float64)
+    if max(size) <= pitch:
+        return [_small_box(extent, middle, material, faces, fit)]
+    longest = int(np.argmax(np.round(extent, 4)))
     made = []
     for face in faces:
         corner, right, down, right_sign, down_sign = _FACES[face]
         across, fall = np.zeros(3), np.zeros(3)
-        across[right], fall[down] = right_sign * size[right], down_sign * size[down]
-        start = middle + half * corner
-        made.append(
-            panel(start, across, fall, material, pitch=pitch, fit=fit, turned=down == longest, origin=origin)  # type: ignore[arg-type]
-        )
+        across[right], fall[down] = right_sign * extent[right], down_sign * extent[down]
+        start, origin = middle + extent / 2 * corner, _picture_origin(middle)
+        turned = down == longest
+        made.append(panel(start, across, fall, material, pitch=pitch, fit=fit, turned=turned, origin=origin))
     return made
 
 
@@ -269,3 +310,29 @@ def yawed(surfaces: list[Surface], yaw: float, offset: Vector = (0.0, 0.0, 0.0))
     """The same surfaces turned about +Y by `yaw` radians, then shifted."""
     cosine, sine = np.cos(yaw), np.sin(yaw)
     return moved(surfaces, np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]), np.asarray(offset))
+
+
+def leaned(surfaces: list[Surface], angle: float) -> list[Surface]:
+    """The same surfaces turned about +X by `angle` radians; negative angles lean them back."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return moved(surfaces, np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]]), np.zeros(3))
+
+
+def joined(surfaces: list[Surface]) -> list[Surface]:
+    """The same triangles with one surface per material, in order of first appearance."""
+    by_material: dict[int, list[Surface]] = {}
+    for surface in surfaces:
+        by_material.setdefault(id(surface.material), []).append(surface)
+    made = []
+    for parts in by_material.values():
+        starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+        made.append(
+            Surface(
+                np.concatenate([part.vertices for part in parts]),
+                np.concatenate([part.normals for part in parts]),
+                np.concatenate([part.uv for part in parts]),
+                np.concatenate([p.triangles + np.int32(start) for p, start in zip(parts, starts, strict=True)]),
+                parts[0].material,
+            )
+        )
+    return made

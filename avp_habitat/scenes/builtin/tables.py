@@ -80,11 +80,10 @@ def dining_table(kit: Kit, dice: Dice, width: float, depth: float) -> Piece:
     made += box((width * 0.7, 0.006, 0.32), (0, high + 0.003, 0), dice.pick(kit.cushions), pitch=0.3)
     made += shifted(vase(kit, dice, dice.number(0.24, 0.36)), 0.05, high + 0.007, 0.0)
     made += shifted(bowl(kit, dice), -width * 0.22, high + 0.007, 0.0)
+    plate = [(0.001, 0.012), (0.08, 0.012), (0.125, 0.024), (0.12, 0.016), (0.07, 0.0)]
     for x in (-width * 0.25, width * 0.25):
         for z in (-depth * 0.33, depth * 0.33):
-            plate = lathe([(0.001, 0.012), (0.08, 0.012), (0.125, 0.024), (0.12, 0.016), (0.07, 0.0)], (x, high + 0.001, z),
-                          kit.ceramics[2], segments=16)  # fmt: skip
-            made += plate
+            made += lathe(plate, (x, high + 0.001, z), kit.ceramics[2], segments=16)
     return Piece("dining table", made, width, depth, high + 0.37)
 
 
@@ -120,7 +119,7 @@ def desk(kit: Kit, dice: Dice) -> Piece:
     made += box(
         (0.59, 0.34, 0.004), (-0.08, high + 0.31, -0.131), kit.screen, faces=("front",), fit=(0, 0, 1, 1), pitch=1
     )
-    made += box((0.42, 0.02, 0.14), (-0.08, high + 0.011, 0.14), kit.screen, fit=(0.1, 0.2, 0.45, 0.7), pitch=1)
+    made += box((0.42, 0.02, 0.14), (-0.08, high + 0.011, 0.14), kit.keys, fit=(0, 0, 1, 1), pitch=1)
     made += shifted(table_lamp(kit, dice), width / 2 - 0.2, high + 0.001, -0.12)
     made += shifted(book_stack(kit, dice), -width / 2 + 0.17, high + 0.001, 0.05)
     return Piece("desk", made, width, depth, 1.25, (Lamp((width / 2 - 0.2, 1.05, 0.0), 0.12),))

@@ -29,7 +29,7 @@ def _threads(dice: Dice, size: tuple[int, int], pitch: int) -> Field:
     over = (column + row) % 2
     bump = np.where(over > 0, wave(u * across), wave(v * down))
     yarn = np.where(over > 0, value_noise(dice, size, (12, across)), value_noise(dice, size, (down, 12)))
-    return 0.72 + 0.22 * bump + 0.34 * (yarn - 0.5) + 0.2 * (fractal(dice, size, (6, 6), 5, 0.8) - 0.5)
+    return 0.76 + 0.2 * bump + 0.26 * (yarn - 0.5) + 0.18 * (fractal(dice, size, (6, 6), 5, 0.8) - 0.5)
 
 
 def weave(dice: Dice, colour: Colour, second: Colour) -> Picture:

@@ -1,0 +1,163 @@
+"""A floor that fills with furniture, none of it in another's place, the door free, the rest walkable."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.scenes.builtin.groups import Group, Member
+from avp_habitat.scenes.builtin.masonry import CURTAIN_M, curtain_bottom
+from avp_habitat.scenes.builtin.piece import FLAT_M, Piece
+from avp_habitat.scenes.builtin.shapes import Surface, moved
+from avp_habitat.scenes.builtin.shell import Point, Shell, Wall
+from avp_habitat.scenes.builtin.walkway import walkable_share
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A piece and where it stands."""
+
+    piece: Piece
+    """What."""
+    axes: Float
+    """`(3, 3)` columns are the piece's x, y and z in the world."""
+    position: Point
+    """x, z of its foot in metres."""
+    footprint: tuple[float, float, float, float]
+    """x0, z0, x1, z1 of the axis-aligned rectangle that it keeps to."""
+
+    def surfaces(self) -> list[Surface]:
+        """Its triangles in the world frame."""
+        return moved(self.piece.surfaces, self.axes, np.array([self.position[0], 0.0, self.position[1]]))
+
+
+@dataclass(frozen=True)
+class Block:
+    """An axis-aligned box that furniture occupies or that must stay free."""
+
+    x0: float
+    z0: float
+    x1: float
+    z1: float
+    low: float = 0.0
+    high: float = 2.0
+    solid: bool = True
+
+    def meets(self, other: "Block", margin: float = 0.0) -> bool:
+        """Whether two boxes come closer than the margin on the floor and overlap in height."""
+        return (
+            self.x0 < other.x1 + margin
+            and other.x0 < self.x1 + margin
+            and self.z0 < other.z1 + margin
+            and other.z0 < self.z1 + margin
+            and self.low < other.high
+            and other.low < self.high
+        )
+
+
+_QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+"""Cosine and sine of quarter turns."""
+
+
+class Floor:
+    """A room that fills with furniture."""
+
+    def __init__(self, shell: Shell) -> None:
+        """Start with the empty room; doors, windows and curtains claim their places.
+
+        Args:
+            shell: the empty room.
+        """
+        self.shell = shell
+        self.placed: list[Placed] = []
+        self.blocks: list[Block] = []
+        self.rugs: list[Block] = []
+        for hole in shell.openings:
+            wall = shell.walls[hole.wall]
+            if hole.kind == "door":
+                self.blocks.append(_before(wall, hole.left - 0.1, hole.right + 0.1, 1.0, 0.03, 2.1, solid=False))
+                continue
+            self.blocks.append(_before(wall, hole.left, hole.right, 0.4, hole.bottom, hole.top, solid=False))
+            for left, right in ((hole.left - CURTAIN_M, hole.left + 0.05), (hole.right - 0.05, hole.right + CURTAIN_M)):
+                low = curtain_bottom(shell, hole)
+                self.blocks.append(_before(wall, left, right, 0.16, low, hole.top + 0.2, solid=True))
+
+    def try_group(self, group: Group, wall: Wall, right: float, inwards: float = 0.0, *, least_share: float) -> bool:
+        """Place a group with the middle of its back at a point, if everything fits and the room stays walkable."""
+        stands = [stand_at(member, wall, right, inwards) for member in group.members]
+        solids, rugs = [], []
+        for stand in stands:
+            if not self._holds(stand):
+                return False
+            (rugs if stand.piece.height <= FLAT_M else solids).append(Block(*stand.footprint, 0.03, stand.piece.height))
+        areas = [_area(rectangle, wall, right, inwards) for rectangle in group.clear]
+        if not all(self.shell.contains(area.x0, area.z0, area.x1, area.z1) for area in areas):
+            return False
+        if any(block.meets(solid, 0.02 if block.solid else 0.0) for block in self.blocks for solid in solids):
+            return False
+        if any(block.solid and block.meets(area) for block in self.blocks for area in areas):
+            return False
+        if self._rugs_in_the_way(solids, rugs):
+            return False
+        solid_blocks = [block for block in self.blocks if block.solid] + solids
+        if walkable_share(self.shell, [(b.x0, b.z0, b.x1, b.z1) for b in solid_blocks]) < least_share:
+            return False
+        self.placed += stands
+        self.blocks += solids + areas
+        self.rugs += rugs
+        return True
+
+    def _rugs_in_the_way(self, solids: list[Block], rugs: list[Block]) -> bool:
+        """Whether new furniture would stand on a rug of others, or a new rug lie under others or on another rug."""
+        flat = [Block(rug.x0, rug.z0, rug.x1, rug.z1) for rug in self.rugs]
+        if any(rug.meets(other, 0.05) for rug in flat for other in solids + rugs):
+            return True
+        standing = [Block(block.x0, block.z0, block.x1, block.z1) for block in self.blocks if block.solid]
+        return any(rug.meets(other, 0.02) for rug in rugs for other in standing)
+
+    def _holds(self, stand: Placed) -> bool:
+        """Whether a piece is inside the room; a partition may reach into its wall."""
+        x0, z0, x1, z1 = stand.footprint
+        slack = 0.02 if stand.piece.kind == "partition" else 0.0
+        along_x = x1 - x0 > z1 - z0
+        dx, dz = (slack, 0.0) if along_x else (0.0, slack)
+        return self.shell.contains(x0 + dx, z0 + dz, x1 - dx, z1 - dz)
+
+    def is_free(self, stand: Placed, low: float, high: float) -> bool:
+        """Whether nothing is where a piece would hang between two heights in metres."""
+        block = Block(*stand.footprint, low, high)
+        return self.shell.contains(*stand.footprint) and not any(block.meets(other, 0.03) for other in self.blocks)
+
+    def hang(self, stand: Placed, low: float, high: float) -> None:
+        """Put something on a wall or ceiling, where it takes no floor."""
+        self.placed.append(stand)
+        self.blocks.append(Block(*stand.footprint, low, high, False))
+
+
+def _before(wall: Wall, left: float, right: float, deep: float, low: float, high: float, *, solid: bool) -> Block:
+    (xa, za), (xb, zb) = wall.point(left, 0.0), wall.point(right, deep)
+    return Block(min(xa, xb), min(za, zb), max(xa, xb), max(za, zb), low, high, solid)
+
+
+def _area(rectangle: tuple[float, float, float, float], wall: Wall, right: float, inwards: float) -> Block:
+    (xa, za), (xb, zb) = (
+        wall.point(right + rectangle[0], inwards + rectangle[1]),
+        wall.point(right + rectangle[2], inwards + rectangle[3]),
+    )
+    return Block(min(xa, xb), min(za, zb), max(xa, xb), max(za, zb), 0.03, 1.9, False)
+
+
+def stand_at(member: Member, wall: Wall, right: float, inwards: float) -> Placed:
+    """A member of a group in the world."""
+    cosine, sine = _QUARTERS[member.quarter]
+    if member.twist:
+        c, s = float(np.cos(member.twist)), float(np.sin(member.twist))
+        cosine, sine = cosine * c - sine * s, sine * c + cosine * s
+    turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
+    axes = wall.axes() @ turn
+    x, z = wall.point(right + member.x, inwards + member.z)
+    half = np.abs(axes[:, [0, 2]]) @ np.array([member.piece.width / 2, member.piece.depth / 2])
+    footprint = (x - float(half[0]), z - float(half[2]), x + float(half[0]), z + float(half[2]))
+    return Placed(member.piece, axes, (x, z), footprint)
