@@ -32,6 +32,13 @@ def _optimizer(iterations: int) -> dict[str, object]:
     }
 
 
+def set_iterations(config: TrainerConfig, iterations: int) -> None:
+    """Train for so many iterations, with the learning rates falling over just these."""
+    config.max_num_iterations = iterations
+    for group in config.optimizers.values():
+        group["scheduler"].max_steps = iterations
+
+
 def trainer_config() -> TrainerConfig:
     """The whole configuration, for CUDA where there is a device and else for the CPU."""
     cuda = torch.cuda.is_available()
