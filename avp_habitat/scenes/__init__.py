@@ -1,0 +1,1 @@
+"""Scenes as textured triangle meshes: read from files, or generated."""
