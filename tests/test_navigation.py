@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 
 from avp_habitat.errors import SceneError
 from avp_habitat.navigation.area import NavigableArea, build_area
+from avp_habitat.navigation.parts import _border_distance
+from avp_habitat.navigation.settings import NavigationSettings
 from avp_habitat.scenes.mesh import TexturedMesh
 
 WIDTH, HEIGHT, DEPTH = 4.2, 2.5, 3.1
@@ -119,6 +121,38 @@ def test_step_between_one_and_two_voxels_depends_on_where_voxels_begin_as_in_rec
     assert reaches(area, 3.6, 1.5) is taken
 
 
+def test_agent_keeps_its_radius_from_a_ledge():
+    stage = box((1.33, 0, 0), (WIDTH, 1.0, DEPTH))
+    area = area_of(room(height=3.0), stage, start=np.array([3.0, 1.0, 1.5]))
+    np.testing.assert_allclose(area.centres[:, 1], 1.0, atol=1e-6)
+    assert 1.33 + 0.1 <= area.rings[0][:, 0].min() <= 1.33 + 0.2
+
+
+@pytest.mark.parametrize(("climb", "taken"), [(0.2, False), (0.4, True)])
+def test_low_hanging_sheet_is_stepped_onto_when_it_is_within_the_climb(climb, taken):
+    sheet = quad((1.5, 0.5, 1.0), (3.0, 0.5, 1.0), (3.0, 0.5, 2.1), (1.5, 0.5, 2.1))
+    area = area_of(room(), sheet, settings=NavigationSettings(max_climb_m=climb))
+    assert reaches(area, 2.2, 1.5) is taken
+
+
+def test_border_distance_is_the_chamfer_distance():
+    shape = (17, 23)
+    solid = np.random.default_rng(5).random(shape) < 0.06
+    number = np.where(solid, -1, np.cumsum(~solid).reshape(shape) - 1)
+    padded = np.pad(number, 1, constant_values=-1)
+    beside = np.stack([padded[1:-1, :-2], padded[2:, 1:-1], padded[1:-1, 2:], padded[:-2, 1:-1]], axis=-1)[~solid]
+    graph = networkx.Graph()
+    for (row, column), (down, across) in itertools.product(np.ndindex(shape), [(0, 1), (1, 0), (1, 1), (1, -1)]):
+        ends = padded[row + 1, column + 1], padded[row + 1 + down, column + 1 + across]
+        if min(ends) >= 0:
+            graph.add_edge(*ends, weight=3 if down and across else 2)
+    borders = set(np.flatnonzero(beside.min(axis=1) < 0).tolist())
+    expected = networkx.multi_source_dijkstra_path_length(graph, borders)
+    distance = _border_distance(beside)
+    np.testing.assert_array_equal(distance, [expected[i] for i in range(len(beside))])
+    assert distance.max() > 3
+
+
 def test_table_leaves_a_hole_and_its_surroundings():
     area = area_of(room(), box((1.2, 0, 0.9), (2.3, 0.75, 1.5)))
     assert len(area.rings) == 2
@@ -199,8 +233,8 @@ def test_one_storey_is_kept_where_two_lie_over_each_other():
     landing = box((6.0, 2.2, 0.0), (8.0, 2.4, 5.0))
     area = area_of(hall, ramp, gallery, landing)
     assert reaches(area, 2.0, 2.0)
-    steps = np.abs(np.diff(area.heights, axis=1))[area.mask[:, 1:] & area.mask[:, :-1]]
-    assert steps.max() < 0.25
+    for heights, mask in ((area.heights, area.mask), (area.heights.T, area.mask.T)):
+        assert np.abs(np.diff(heights, axis=1))[mask[:, 1:] & mask[:, :-1]].max() < 0.4
 
 
 def test_floor_height_is_the_meshs_not_the_voxels():
@@ -334,8 +368,24 @@ def test_component_along_a_wall_is_kept(along, into, sideways):
     begin = np.array([5.0, 0.0]) + along * wall + 0.05 * inner
     move = sideways * wall - (0.05 + into) * inner
     end = area.slide(on_floor(begin), on_floor(move))[0, [0, 2]]
-    assert (end - begin) @ wall == pytest.approx(sideways, abs=1e-9)
+    assert (end - begin) @ wall == pytest.approx(sideways, abs=1e-8)
     assert 0 < (end - [5.0, 0.0]) @ inner < 0.001
+
+
+@pytest.mark.parametrize("corner", [*PILLAR.tolist(), *BLADE.tolist(), [3.0, 3.0]])
+def test_aiming_exactly_at_a_corner_leads_around_it_not_into_the_obstacle(corner):
+    area = plane()
+    angles = np.linspace(0, 2 * np.pi, 721)
+    ring = np.array(corner) - 0.25 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    for shift in (0.0, 3e-5, -3e-5):
+        aside = shift * np.stack([-np.sin(angles), np.cos(angles)], axis=1)
+        begin = on_floor(*(ring + aside))
+        begin, towards = (values[area.contains(begin)] for values in (begin, on_floor(*(np.array(corner) - ring))))
+        towards[:, 1] = 0
+        ends = area.slide(begin, 2 * towards)
+        assert area.contains(ends).all()
+        for start, end in zip(begin[::9], ends[::9], strict=True):
+            assert area.geodesic_distance(start, end[None])[0] < 0.51
 
 
 def test_zero_displacement_changes_nothing():
