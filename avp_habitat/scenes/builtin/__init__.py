@@ -1,5 +1,7 @@
 """Furnished rooms that are made up from a number: `builtin:SEED`."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from avp_habitat.errors import UsageError
@@ -38,16 +40,23 @@ def plan_room(seed: int) -> tuple[Shell, list[Placed]]:
     return shell, furnish(shell, Dice(seed, 2), Kit(seed))
 
 
+def _snapped(values: np.ndarray) -> np.ndarray:
+    """Rounded to whole 2^-13 (0.12 mm), so that the last bits of a platform's sine do not matter.
+
+    A power of two, because sums of decimal lengths then never lie half-way between two steps.
+    """
+    return np.rint(values * 8192) / 8192
+
+
 def _mesh(surface: Surface, colours: np.ndarray) -> TexturedMesh:
-    """Rounded to what a person cannot see, so that the last bits of a platform's sine do not matter."""
-    picture = surface.material.picture
+    """A surface as the renderers take it."""
     return TexturedMesh(
-        np.round(surface.vertices, 4).astype(np.float32),
+        surface.vertices.astype(np.float32),
         surface.triangles.astype(np.int32),
-        np.round(surface.uv, 4).astype(np.float32),
+        surface.uv.astype(np.float32),
         (np.rint(colours * 255) / 255).astype(np.float32),
         np.zeros(len(surface.triangles), np.int32),
-        [picture],
+        [surface.material.picture],
     )
 
 
@@ -74,6 +83,6 @@ def generate_room(seed: int) -> TexturedMesh:
     for stand in placed:
         surfaces += stand.surfaces()
         lamps += [_in_world(stand, lamp) for lamp in stand.piece.lamps]
-    surfaces = joined(surfaces)
+    surfaces = [replace(s, vertices=_snapped(s.vertices), uv=_snapped(s.uv)) for s in joined(surfaces)]
     colours = bake(shell, surfaces, lamps)
     return merge([_mesh(surface, colour) for surface, colour in zip(surfaces, colours, strict=True)])

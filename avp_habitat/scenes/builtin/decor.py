@@ -20,8 +20,8 @@ def floor_lamp(kit: Kit, dice: Dice) -> Piece:
     high = dice.number(1.55, 1.75)
     made = cylinder(0.15, 0.0, 0.025, (0, 0, 0), kit.metal, 18)
     made += lathe([(0.014, high - 0.1), (0.014, 0.025)], (0, 0, 0), kit.metal, segments=8)
-    made += lathe([(0.15, high), (0.2, high - 0.3)], (0, 0, 0), kit.lampshade, segments=18)
-    made += lathe([(0.001, high - 0.02), (0.15, high - 0.02)], (0, 0, 0), kit.lampshade, segments=18)
+    made += lathe([(0.15, high), (0.2, high - 0.3)], (0, 0, 0), kit.lampshade, segments=18, open_ended=True)
+    made += lathe([(0.001, high - 0.02), (0.148, high - 0.02)], (0, 0, 0), kit.lampshade, segments=18, open_ended=True)
     return Piece("floor lamp", made, 0.42, 0.42, high, (Lamp((0.0, high - 0.2, 0.0), 0.3),))
 
 
@@ -38,7 +38,7 @@ def pendant(kit: Kit, dice: Dice, ceiling: float, bottom: float) -> Piece:
         )
     )
     outline = [(radius, y + bottom) for radius, y in profile]
-    made += lathe(outline, (0, 0, 0), kit.lampshade, segments=20)
+    made += lathe(outline, (0, 0, 0), kit.lampshade, segments=20, open_ended=True)
     made += lathe([(0.001, bottom + 0.23), (outline[0][0], bottom + 0.235)], (0, 0, 0), kit.metal, segments=12)
     return Piece("pendant", made, 0.52, 0.52, ceiling, (Lamp((0.0, bottom - 0.05, 0.0), 0.45),))
 

@@ -9,6 +9,7 @@ from avp_habitat.scenes.builtin.noise import (
     Field,
     blend,
     coordinates,
+    cosine_of_multiple,
     fractal,
     mix,
     plain,
@@ -113,7 +114,7 @@ def _tile_motif(u: Field, v: Field, kind: int) -> Field:
     radius = np.sqrt(u * u + v * v)
     corner = np.sqrt((1 - x) * (1 - x) + (1 - y) * (1 - y))
     if kind == 0:
-        petals = radius - (0.55 + 0.3 * np.cos(8 * np.arctan2(v, u)))
+        petals = radius - (0.55 + 0.3 * cosine_of_multiple(u, v, 8))
         return np.maximum(step(-petals, 0, 0.05), step(-np.abs(corner - 0.45), -0.07, 0.04))
     if kind == 1:
         star = np.minimum(x + y, np.maximum(x, y) * np.float32(1.41)) - 0.62
@@ -152,9 +153,9 @@ def plaster(dice: Dice, colour: Colour) -> Picture:
 
 def _motif(u: Field, v: Field, kind: int) -> Field:
     """Share of ink of one wallpaper motif; u, v in [-1, 1]."""
-    angle, radius = np.arctan2(v, u), np.sqrt(u * u + v * v)
+    radius = np.sqrt(u * u + v * v)
     if kind == 0:
-        petals = step(-radius + 0.5 + 0.28 * np.cos(5 * angle), 0, 0.05) * step(radius, 0.16, 0.05)
+        petals = step(-radius + 0.5 + 0.28 * cosine_of_multiple(u, v, 5), 0, 0.05) * step(radius, 0.16, 0.05)
         return np.maximum(petals, step(-radius, -0.1, 0.04))
     if kind == 1:
         leaf = step(-np.abs(u) + 0.42 * (1 - v * v) * (1 - 0.45 * v), 0, 0.05) * step(-np.abs(v), -0.9, 0.05)

@@ -12,7 +12,7 @@ from avp_habitat.scenes.builtin.shapes import Surface, moved
 from avp_habitat.scenes.builtin.shell import Point, Shell, Wall
 from avp_habitat.scenes.builtin.walkway import walkable_share
 
-Float = NDArray[np.float64]
+Float = NDArray[np.floating]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,15 +125,20 @@ class Floor:
         dx, dz = (slack, 0.0) if along_x else (0.0, slack)
         return self.shell.contains(x0 + dx, z0 + dz, x1 - dx, z1 - dz)
 
-    def is_free(self, stand: Placed, low: float, high: float) -> bool:
-        """Whether nothing is where a piece would hang between two heights in metres."""
+    def is_free(self, stand: Placed, low: float, high: float, margin: float) -> bool:
+        """Whether nothing comes closer than a margin to where a piece would hang between two heights, metres."""
         block = Block(*stand.footprint, low, high)
-        return self.shell.contains(*stand.footprint) and not any(block.meets(other, 0.03) for other in self.blocks)
+        return self.shell.contains(*stand.footprint) and not any(block.meets(other, margin) for other in self.blocks)
 
     def hang(self, stand: Placed, low: float, high: float) -> None:
         """Put something on a wall or ceiling, where it takes no floor."""
         self.placed.append(stand)
         self.blocks.append(Block(*stand.footprint, low, high, False))
+
+
+def places(start: float, end: float, pitch: float) -> list[float]:
+    """Positions from start up to but without end, metres, rounded to centimetres."""
+    return [round(start + index * pitch, 2) for index in range(max(0, int((end - start) / pitch - 1e-9) + 1))]
 
 
 def _before(wall: Wall, left: float, right: float, deep: float, low: float, high: float, *, solid: bool) -> Block:
@@ -159,5 +164,6 @@ def stand_at(member: Member, wall: Wall, right: float, inwards: float) -> Placed
     axes = wall.axes() @ turn
     x, z = wall.point(right + member.x, inwards + member.z)
     half = np.abs(axes[:, [0, 2]]) @ np.array([member.piece.width / 2, member.piece.depth / 2])
-    footprint = (x - float(half[0]), z - float(half[2]), x + float(half[0]), z + float(half[2]))
+    wide, deep = float(half[0]), float(half[2])
+    footprint = (round(x - wide, 6), round(z - deep, 6), round(x + wide, 6), round(z + deep, 6))
     return Placed(member.piece, axes, (x, z), footprint)

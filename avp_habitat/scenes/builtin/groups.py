@@ -182,7 +182,7 @@ def partition(kit: Kit, dice: Dice, material: Material, length: float, ceiling: 
     )
     made += box((length, ceiling, thick), (0, ceiling / 2, 0), kit.trim, faces=("left", "right"), pitch=0.25)
     made += box(
-        (length - 0.002, 0.09, thick + 0.03), (0, 0.045, 0), kit.trim, faces=("front", "back", "left", "right", "top")
+        (length - 0.008, 0.09, thick + 0.03), (0, 0.045, 0), kit.trim, faces=("front", "back", "left", "right", "top")
     )
     wide = min(length - 0.5, dice.number(0.6, 0.9))
     front = shifted(decor.picture(kit, dice, wide, 0.62), 0, 1.55, thick / 2)

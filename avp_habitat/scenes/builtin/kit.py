@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 from avp_habitat.scenes.builtin import finishes, pictures, textiles
 from avp_habitat.scenes.builtin.dice import Dice
@@ -49,7 +49,7 @@ SCHEMES = (
 
 
 class Kit:
-    """Materials of one room, painted when first asked for and the same however often and in whatever order."""
+    """Materials of one room, painted when first looked at and the same in whatever order that happens."""
 
     def __init__(self, seed: int) -> None:
         """Choose the colour scheme.
@@ -78,17 +78,17 @@ class Kit:
         dice, colour = self._dice(1), self.scheme.floor
         kind = dice.whole(0, 5)
         if kind <= 2:
-            return Material(finishes.boards(dice, colour), 2.0, 1.67)
+            return Material(partial(finishes.boards, dice, colour), 2.0, 1.67)
         if kind == 3:
-            return Material(finishes.parquet(dice, colour), 1.6, 1.6)
+            return Material(partial(finishes.parquet, dice, colour), 1.6, 1.6)
         ink = blend(self.scheme.feature, (0.3, 0.3, 0.35), 0.4)
         base = (0.88, 0.85, 0.79) if kind == 5 else blend(colour, (0.8, 0.75, 0.7), 0.5)
-        return Material(finishes.tiles(dice, base, ink, patterned=kind == 5), 1.5, 1.5)
+        return Material(partial(finishes.tiles, dice, base, ink, patterned=kind == 5), 1.5, 1.5)
 
     @cached_property
     def wall(self) -> Material:
         """Painted plaster."""
-        return Material(finishes.plaster(self._dice(2), self.scheme.wall), 1.8, 1.8)
+        return Material(partial(finishes.plaster, self._dice(2), self.scheme.wall), 1.8, 1.8)
 
     @cached_property
     def feature_wall(self) -> Material:
@@ -96,48 +96,50 @@ class Kit:
         dice = self._dice(3)
         if dice.chance(0.25):
             warm = blend(self.scheme.feature, (0.7, 0.42, 0.33), 0.7)
-            return Material(finishes.brick(dice, warm), 1.25, 1.2)
+            return Material(partial(finishes.brick, dice, warm), 1.25, 1.2)
         ground = blend(self.scheme.feature, self.scheme.wall, dice.pick((0.0, 0.35, 0.7)))
         ink = blend(self.scheme.wall, self.scheme.feature, 0.1) if dice.chance(0.5) else shade(self.scheme.feature, 0.6)
-        return Material(finishes.wallpaper(dice, ground, ink), 1.2, 1.2)
+        return Material(partial(finishes.wallpaper, dice, ground, ink), 1.2, 1.2)
 
     @cached_property
     def papered_wall(self) -> Material:
         """A quieter wallpaper in the colour of most walls."""
         ink = blend(self.scheme.wall, self.scheme.feature, 0.65)
-        return Material(finishes.wallpaper(self._dice(4), self.scheme.wall, ink), 1.0, 1.0)
+        return Material(partial(finishes.wallpaper, self._dice(4), self.scheme.wall, ink), 1.0, 1.0)
 
     @cached_property
     def ceiling(self) -> Material:
         """White plaster."""
-        return Material(finishes.plaster(self._dice(5), (0.96, 0.96, 0.95)), 2.4, 2.4)
+        return Material(partial(finishes.plaster, self._dice(5), (0.96, 0.96, 0.95)), 2.4, 2.4)
 
     @cached_property
     def trim(self) -> Material:
         """White paint of frames, doors and skirting."""
-        return Material(finishes.paint(self._dice(6), (0.96, 0.96, 0.94)), 1.2, 0.6)
+        return Material(partial(finishes.paint, self._dice(6), (0.96, 0.96, 0.94)), 1.2, 0.6)
 
     @cached_property
     def wood(self) -> Material:
         """The wood of most furniture."""
-        return Material(finishes.wood(self._dice(7), self.scheme.wood), 1.2, 0.6)
+        return Material(partial(finishes.wood, self._dice(7), self.scheme.wood), 1.2, 0.6)
 
     @cached_property
     def dark_wood(self) -> Material:
         """A darker wood for legs and frames."""
-        return Material(finishes.wood(self._dice(8), shade(self.scheme.wood, 0.6)), 1.2, 0.6)
+        return Material(partial(finishes.wood, self._dice(8), shade(self.scheme.wood, 0.6)), 1.2, 0.6)
 
     @cached_property
     def upholstery(self) -> Material:
         """Coarse cloth of the sofa."""
         colour = self.scheme.upholstery
-        return Material(textiles.weave(self._dice(9), shade(colour, 1.1), blend(colour, (1, 1, 1), 0.5)), 0.6, 0.6)
+        return Material(
+            partial(textiles.weave, self._dice(9), shade(colour, 1.1), blend(colour, (1, 1, 1), 0.5)), 0.6, 0.6
+        )
 
     @cached_property
     def second_cloth(self) -> Material:
         """Coarse cloth of armchairs and chairs."""
         colour = self.scheme.accents[self._dice(10).whole(0, 1)]
-        return Material(textiles.weave(self._dice(10), shade(colour, 1.05), shade(colour, 0.6)), 0.6, 0.6)
+        return Material(partial(textiles.weave, self._dice(10), shade(colour, 1.05), shade(colour, 0.6)), 0.6, 0.6)
 
     @cached_property
     def cushions(self) -> list[Material]:
@@ -146,7 +148,7 @@ class Kit:
         for index in range(3):
             dice = self._dice(20 + index)
             first, second, third = dice.shuffled([*self.scheme.accents])
-            made.append(Material(textiles.printed(dice, (first, second, third)), 0.5, 0.5))
+            made.append(Material(partial(textiles.printed, dice, (first, second, third)), 0.5, 0.5))
         return made
 
     @cached_property
@@ -154,29 +156,31 @@ class Kit:
         """Printed cloth of the curtains."""
         dice, accents = self._dice(30), self.scheme.accents
         ground = blend(accents[2], (0.95, 0.93, 0.9), 0.5)
-        return Material(textiles.printed(dice, (ground, accents[0], accents[1])), 0.7, 0.7)
+        return Material(partial(textiles.printed, dice, (ground, accents[0], accents[1])), 0.7, 0.7)
 
     @cached_property
     def bedding(self) -> Material:
         """The quilt."""
         first, second, third = self._dice(31).shuffled([*self.scheme.accents])
-        return Material(textiles.bedding(self._dice(31), (blend(first, (1, 1, 1), 0.4), second, third)), 1.2, 1.2)
+        return Material(
+            partial(textiles.bedding, self._dice(31), (blend(first, (1, 1, 1), 0.4), second, third)), 1.2, 1.2
+        )
 
     @cached_property
     def linen(self) -> Material:
         """Light cloth of mattress and pillows."""
-        return Material(textiles.weave(self._dice(32), (0.93, 0.91, 0.87), (0.75, 0.77, 0.82)), 0.6, 0.6)
+        return Material(partial(textiles.weave, self._dice(32), (0.93, 0.91, 0.87), (0.75, 0.77, 0.82)), 0.6, 0.6)
 
     @cached_property
     def metal(self) -> Material:
         """Dark or brass-like metal."""
         colour = self._dice(33).pick(((0.28, 0.28, 0.30), (0.72, 0.58, 0.34), (0.62, 0.63, 0.65)))
-        return Material(finishes.brushed(self._dice(33), colour), 0.4, 0.4)
+        return Material(partial(finishes.brushed, self._dice(33), colour), 0.4, 0.4)
 
     @cached_property
     def black(self) -> Material:
         """Black plastic."""
-        return Material(finishes.speckled(self._dice(34), (0.12, 0.12, 0.13), (0.2, 0.2, 0.22)), 0.4, 0.4)
+        return Material(partial(finishes.speckled, self._dice(34), (0.12, 0.12, 0.13), (0.2, 0.2, 0.22)), 0.4, 0.4)
 
     @cached_property
     def ceramics(self) -> list[Material]:
@@ -184,7 +188,9 @@ class Kit:
         made = []
         for index, colour in enumerate((*self.scheme.accents[:2], (0.88, 0.86, 0.82))):
             dice = self._dice(40 + index)
-            made.append(Material(finishes.speckled(dice, colour, shade(colour, dice.pick((0.5, 1.5)))), 0.4, 0.4))
+            made.append(
+                Material(partial(finishes.speckled, dice, colour, shade(colour, dice.pick((0.5, 1.5)))), 0.4, 0.4)
+            )
         return made
 
     @cached_property
@@ -193,51 +199,51 @@ class Kit:
         base, vein = self._dice(50).pick(
             (((0.93, 0.92, 0.90), (0.5, 0.5, 0.54)), ((0.3, 0.36, 0.33), (0.8, 0.82, 0.76)))
         )
-        return Material(finishes.marble(self._dice(50), base, vein), 1.2, 1.2)
+        return Material(partial(finishes.marble, self._dice(50), base, vein), 1.2, 1.2)
 
     @cached_property
     def wicker(self) -> Material:
         """Basket weave."""
-        return Material(finishes.wicker(self._dice(51), (0.80, 0.62, 0.40)), 0.3, 0.3)
+        return Material(partial(finishes.wicker, self._dice(51), (0.80, 0.62, 0.40)), 0.3, 0.3)
 
     @cached_property
     def leaf(self) -> Material:
         """One leaf."""
         green = self._dice(52).pick(((0.26, 0.45, 0.22), (0.34, 0.50, 0.28), (0.22, 0.40, 0.30)))
-        return Material(finishes.foliage(self._dice(52), green), 1.0, 1.0)
+        return Material(partial(finishes.foliage, self._dice(52), green), 1.0, 1.0)
 
     @cached_property
     def books(self) -> Material:
         """The atlas of book spines."""
-        return Material(pictures.spines(self._dice(53), self.colours), 1.0, 1.0)
+        return Material(partial(pictures.spines, self._dice(53), self.colours), 1.0, 1.0)
 
     @cached_property
     def lampshade(self) -> Material:
         """Cloth that is lit from behind."""
-        cloth = textiles.weave(self._dice(54), (0.99, 0.91, 0.74), (0.9, 0.78, 0.56))
-        return Material(cloth, 0.4, 0.4, (1.0, 1.0, 1.0), True)
+        cloth = partial(textiles.weave, self._dice(54), (0.99, 0.91, 0.74), (0.9, 0.78, 0.56))
+        return Material(cloth, 0.4, 0.4, glows=True)
 
     @cached_property
     def screen(self) -> Material:
         """A computer screen that is on."""
-        return Material(pictures.screen(self._dice(55), self.colours), 1.0, 1.0, glows=True)
+        return Material(partial(pictures.screen, self._dice(55), self.colours), 1.0, 1.0, glows=True)
 
     @cached_property
     def television(self) -> Material:
         """A film on the television."""
-        return Material(pictures.film(self._dice(56), self.colours), 1.0, 1.0, glows=True)
+        return Material(partial(pictures.film, self._dice(56), self.colours), 1.0, 1.0, glows=True)
 
     @cached_property
     def keys(self) -> Material:
         """A keyboard."""
-        return Material(pictures.keys(self._dice(57)), 1.0, 1.0)
+        return Material(partial(pictures.keys, self._dice(57)), 1.0, 1.0)
 
     def _next(self) -> Dice:
         self._count += 1
         return self._dice(100 + self._count)
 
     def _unique(self, paint: Callable[[Dice], finishes.Picture], *, glows: bool = False) -> Material:
-        return Material(paint(self._next()), 1.0, 1.0, glows=glows)
+        return Material(partial(paint, self._next()), 1.0, 1.0, glows=glows)
 
     def view(self) -> Material:
         """Another view through a window."""

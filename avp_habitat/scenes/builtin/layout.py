@@ -1,55 +1,58 @@
 """Which furniture a room gets and where it is tried first."""
 
-import numpy as np
+from collections.abc import Iterable, Iterator
 
 from avp_habitat.scenes.builtin import decor, groups, storage, tables
 from avp_habitat.scenes.builtin.dice import Dice
-from avp_habitat.scenes.builtin.floorplan import Floor, Placed
+from avp_habitat.scenes.builtin.floorplan import Floor, Placed, places
 from avp_habitat.scenes.builtin.groups import Arrange
 from avp_habitat.scenes.builtin.hanging import hang_lamp, hang_pictures
 from avp_habitat.scenes.builtin.kit import Kit
-from avp_habitat.scenes.builtin.shell import Shell
+from avp_habitat.scenes.builtin.shell import Shell, Wall
+
+Spot = tuple[Wall, float, float]
+"""A wall, metres along it and metres in front of it."""
+
+MAIN, EXTRA, SMALL = 0.45, 0.42, 0.41
+"""Share of the floor that stays walkable after placing main groups, storage, and what fills corners."""
 
 
-def _put_at_wall(
-    floor: Floor, dice: Dice, arrange: Arrange, *, least_share: float, corner: float | None = None
-) -> bool:
-    """Try places along all walls in random order; with `corner`, only those that far from the walls' ends."""
-    shell = floor.shell
-    for wall in dice.shuffled(shell.walls):
-        if corner is not None:
-            spots = dice.shuffled([corner, wall.length - corner])
-        else:
-            spots = dice.shuffled([round(place, 2) for place in np.arange(0.3, wall.length - 0.3, 0.2)])
-        for right in spots:
-            group = arrange(shell.depth_at(wall, right))
-            if group is not None and floor.try_group(group, wall, right, least_share=least_share):
-                return True
+def _put(floor: Floor, arrange: Arrange, spots: Iterable[Spot], least_share: float) -> bool:
+    """Place a group at the first spot where it fits and leaves enough of the floor walkable."""
+    for wall, right, inwards in spots:
+        group = arrange(floor.shell.depth_at(wall, right) - inwards)
+        if group is not None and floor.try_group(group, wall, right, inwards, least_share=least_share):
+            return True
     return False
 
 
-def _put_anywhere(floor: Floor, dice: Dice, arrange: Arrange, *, least_share: float) -> bool:
-    """Try places in the open floor."""
+def _at_walls(floor: Floor, dice: Dice) -> Iterator[Spot]:
+    """Places along all walls in random order."""
     for wall in dice.shuffled(floor.shell.walls):
-        places = [(r, i) for r in np.arange(0.6, wall.length - 0.5, 0.3) for i in np.arange(0.1, 4.0, 0.3)]
-        for right, inwards in dice.shuffled(places)[:120]:
-            group = arrange(floor.shell.depth_at(wall, right) - inwards)
-            if group is not None and floor.try_group(group, wall, right, inwards, least_share=least_share):
-                return True
-    return False
+        for right in dice.shuffled(places(0.3, wall.length - 0.3, 0.2)):
+            yield wall, right, 0.0
 
 
-def _put_divider(floor: Floor, dice: Dice, kit: Kit) -> bool:
-    """Part the room with the longest divider that leaves it walkable."""
-    walls = [wall for wall in floor.shell.walls if wall.length >= 3.0]
-    for arrange in groups.divider(kit, dice, floor.shell.ceiling):
-        for wall in dice.shuffled(walls):
-            for share in dice.shuffled([0.3, 0.36, 0.43, 0.5, 0.57, 0.64, 0.7]):
-                right = round(wall.length * share, 2)
-                group = arrange(floor.shell.depth_at(wall, right))
-                if group is not None and floor.try_group(group, wall, right, least_share=0.48):
-                    return True
-    return False
+def _in_corners(floor: Floor, dice: Dice, distance: float) -> Iterator[Spot]:
+    """Places at walls, a distance in metres from their ends, in random order."""
+    for wall in dice.shuffled(floor.shell.walls):
+        for right in dice.shuffled([distance, wall.length - distance]):
+            yield wall, right, 0.0
+
+
+def _anywhere(floor: Floor, dice: Dice) -> Iterator[Spot]:
+    """Places in the open floor in random order."""
+    for wall in dice.shuffled(floor.shell.walls):
+        spots = [(r, i) for r in places(0.6, wall.length - 0.5, 0.3) for i in places(0.1, 4.0, 0.3)]
+        for right, inwards in dice.shuffled(spots)[:120]:
+            yield wall, right, inwards
+
+
+def _across(floor: Floor, dice: Dice) -> Iterator[Spot]:
+    """Places at long walls, away from their ends, in random order."""
+    for wall in dice.shuffled([wall for wall in floor.shell.walls if wall.length >= 3.0]):
+        for share in dice.shuffled([0.3, 0.36, 0.43, 0.5, 0.57, 0.64, 0.7]):
+            yield wall, round(wall.length * share, 2), 0.0
 
 
 def _storage(kit: Kit, dice: Dice) -> list[Arrange]:
@@ -63,23 +66,23 @@ def _storage(kit: Kit, dice: Dice) -> list[Arrange]:
 
 
 def _put_furniture(floor: Floor, dice: Dice, kit: Kit) -> None:
-    """Main groups by the room's size, then storage, then what fills corners."""
+    """Main groups by the room's size, what parts it, then storage, then what fills corners."""
     area = floor.shell.floor_area
     sleeps = dice.chance(0.6 if area > 22 else 0.4)
     sits = area > 20 or not sleeps
     if sits:
-        any(_put_at_wall(floor, dice, arrange, least_share=0.48) for arrange in groups.living(kit, dice))
+        any(_put(floor, arrange, _at_walls(floor, dice), MAIN) for arrange in groups.living(kit, dice))
     if sleeps:
-        _put_at_wall(floor, dice, groups.sleeping(kit, dice), least_share=0.48)
+        _put(floor, groups.sleeping(kit, dice), _at_walls(floor, dice), MAIN)
     if not (sits and sleeps) or area > 30:
-        _put_anywhere(floor, dice, groups.dining(kit, dice), least_share=0.5)
-    _put_divider(floor, dice, kit)
-    extra = [groups.working(kit, dice), *_storage(kit, dice), groups.reading(kit, dice)]
-    for arrange in extra:
-        _put_at_wall(floor, dice, arrange, least_share=0.45)
+        _put(floor, groups.dining(kit, dice), _anywhere(floor, dice), MAIN)
+    any(_put(floor, arrange, _across(floor, dice), MAIN) for arrange in groups.divider(kit, dice, floor.shell.ceiling))
+    for arrange in (groups.working(kit, dice), *_storage(kit, dice), groups.reading(kit, dice)):
+        _put(floor, arrange, _at_walls(floor, dice), EXTRA)
     for _ in range(2):
-        _put_at_wall(floor, dice, groups.against_wall(decor.plant(kit, dice), 0.0), least_share=0.44, corner=0.42)
-    _put_at_wall(floor, dice, groups.against_wall(tables.side_table(kit, dice), 0.3), least_share=0.44)
+        _put(floor, groups.against_wall(decor.plant(kit, dice), 0.0), _in_corners(floor, dice, 0.42), SMALL)
+    if sum(stand.piece.kind == "side table" for stand in floor.placed) < 2:
+        _put(floor, groups.against_wall(tables.side_table(kit, dice), 0.3), _at_walls(floor, dice), SMALL)
 
 
 def furnish(shell: Shell, dice: Dice, kit: Kit) -> list[Placed]:

@@ -7,11 +7,15 @@ from avp_habitat.scenes.builtin.piece import Lamp
 from avp_habitat.scenes.builtin.shapes import Surface
 from avp_habitat.scenes.builtin.shell import Shell
 
-Float = NDArray[np.float64]
+Float = NDArray[np.floating]
 
 VOXEL_M = 0.1
 PADDING = 8
 """Voxels around the room that count as solid."""
+
+
+_OFF_THE_GRID = 3.7e-5
+"""Metres by which voxels are shifted, so that no wall lies exactly between two of them."""
 
 
 class Voxels:
@@ -25,7 +29,7 @@ class Voxels:
             surfaces: what stands in it.
         """
         x0, z0, x1, z1 = shell.bounds
-        self._origin = np.array([x0, 0.0, z0]) - PADDING * VOXEL_M
+        self._origin = np.array([x0, 0.0, z0]) - PADDING * VOXEL_M - _OFF_THE_GRID
         extent = np.array([x1 - x0, shell.ceiling, z1 - z0])
         shape = tuple(int(n) for n in np.ceil(extent / VOXEL_M) + 2 * PADDING)
         filled = np.ones(shape, np.float32)

@@ -92,7 +92,7 @@ def _curtains(kit: Kit, hole: Opening, bottom: float) -> list[Surface]:
 
 def curtain_bottom(shell: Shell, hole: Opening) -> float:
     """Height in metres at which the curtains of a window end."""
-    return 0.03 if int(shell.ceiling * 100) % 2 else hole.bottom - 0.15
+    return 0.03 if round(shell.ceiling * 100) % 2 else hole.bottom - 0.15
 
 
 def _skirting(kit: Kit, wall: Wall, holes: list[Opening]) -> list[Surface]:

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.scenes.builtin.dice import Dice
 
-Field = NDArray[np.float32]
+Field = NDArray[np.floating]
 Colour = tuple[float, float, float]
 
 
@@ -74,6 +74,24 @@ def step(value: Field, edge: float | Field, width: float) -> Field:
 def wave(value: Field) -> Field:
     """Triangle wave of period 1 in [0, 1]; 0 at whole numbers."""
     return np.abs((value - np.floor(value)) * 2 - 1) * -1 + 1
+
+
+def cosine_of_multiple(u: Field, v: Field, count: int) -> Field:
+    """cos(count x angle) of the direction (u, v), by Chebyshev's recurrence.
+
+    Arithmetic alone, because processors differ in the last bits of their cosines and pictures must not.
+    """
+    cosine = u / np.sqrt(u * u + v * v + np.float32(1e-12))
+    before, now = np.ones_like(cosine), cosine
+    for _ in range(count - 1):
+        before, now = now, 2 * cosine * now - before
+    return now
+
+
+def turn_of(u: Field, v: Field) -> Field:
+    """A number that rises from 0 to 1 with the direction of (u, v) around the origin, though not evenly."""
+    share = u / (np.abs(u) + np.abs(v) + np.float32(1e-12))
+    return np.where(v >= 0, 1 - share, 3 + share) / 4
 
 
 def to_picture(rgb: Field) -> NDArray[np.uint8]:

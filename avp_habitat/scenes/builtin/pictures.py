@@ -15,6 +15,7 @@ from avp_habitat.scenes.builtin.noise import (
     shade,
     step,
     to_picture,
+    turn_of,
     value_noise,
     wave,
 )
@@ -76,8 +77,8 @@ def _hills(dice: Dice, size: tuple[int, int], colours: list[Colour]) -> Field:
 def _rays(dice: Dice, size: tuple[int, int], colours: list[Colour]) -> Field:
     u, v = coordinates(size)
     bend = fractal(dice, size, (3, 3), 4)
-    angle = np.arctan2(v - dice.number(0.2, 0.8), u - dice.number(0.2, 0.8))
-    field = angle * np.float32(1.6) + bend * 4
+    turn = turn_of(u - dice.number(0.2, 0.8), v - dice.number(0.2, 0.8))
+    field = turn * 10 + bend * 4
     rgb = plain(size, colours[0])
     for index, colour in enumerate(colours[1:] + [(0.95, 0.92, 0.86)]):
         rgb = mix(rgb, colour, step(wave(field * (index + 1) * 0.5 + index * 0.3), 0.62, 0.05))

@@ -84,7 +84,7 @@ def office_chair(kit: Kit, dice: Dice) -> Piece:
     made += cylinder(0.035, 0.06, 0.42, (0, 0, 0), kit.metal, 8)
     made += cushion((0.48, 0.09, 0.46), (0, 0.47, 0), 0.04, kit.second_cloth, puff=0.01)
     made += cushion((0.44, 0.52, 0.08), (0, 0.83, -0.22), 0.035, kit.second_cloth, puff=0.01)
-    made += box((0.06, 0.3, 0.03), (0, 0.58, -0.25), kit.black, pitch=1)
+    made += box((0.06, 0.3, 0.03), (0, 0.58, -0.275), kit.black, pitch=1)
     return Piece("office chair", made, 0.56, 0.56, 1.1)
 
 
@@ -102,7 +102,7 @@ def bed(kit: Kit, dice: Dice) -> Piece:
     made += _legs(width - 0.04, depth - 0.04, 0.08, 0.08, kit.dark_wood)
     board = kit.upholstery if dice.chance(0.4) else kit.wood
     made += cushion((width, high - 0.3, 0.07), (0, 0.3 + (high - 0.3) / 2, -depth / 2 + 0.035), 0.03, board)
-    made += cushion((width - 0.04, 0.22, depth - 0.1), (0, 0.41, 0.03), 0.06, kit.linen)
+    made += cushion((width - 0.1, 0.22, depth - 0.14), (0, 0.41, 0.0), 0.06, kit.linen)
     made += cushion((width, 0.2, depth - 0.75), (0, 0.455, 0.345), 0.07, kit.bedding, puff=0.02)
     count = 1 if width < 1.2 else 2
     for index in range(count):

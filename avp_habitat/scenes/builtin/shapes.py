@@ -1,12 +1,14 @@
 """Solids and sheets with texture coordinates in metres, normals outwards, counter-clockwise triangles."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+Float = NDArray[np.floating]
 Vector = tuple[float, float, float]
 Rectangle = tuple[float, float, float, float]
 
@@ -15,8 +17,8 @@ Rectangle = tuple[float, float, float, float]
 class Material:
     """A picture and how it lies on a surface."""
 
-    picture: NDArray[np.uint8]
-    """`(height, width, 3)` sRGB."""
+    paint: Callable[[], NDArray[np.uint8]]
+    """Makes the picture, `(height, width, 3)` sRGB; called once, when the picture is first needed."""
     width_m: float
     """Metres that the picture spans along u."""
     height_m: float
@@ -25,6 +27,11 @@ class Material:
     """Multiplies the picture."""
     glows: bool = False
     """Whether the surface shines by itself, so that baked light leaves it alone."""
+
+    @cached_property
+    def picture(self) -> NDArray[np.uint8]:
+        """`(height, width, 3)` sRGB."""
+        return self.paint()
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +275,12 @@ def cushion(size: Vector, centre: Vector, radius: float, material: Material, *, 
 
 
 def lathe(
-    profile: list[tuple[float, float]], centre: Vector, material: Material, *, segments: int = 12, squash: float = 1.0
+    profile: list[tuple[float, float]],
+    centre: Vector,
+    material: Material,
+    *,
+    segments: int = 12,
+    open_ended: bool = False,
 ) -> list[Surface]:
     """A surface of revolution about a vertical axis.
 
@@ -277,18 +289,18 @@ def lathe(
         centre: foot of the axis in metres.
         material: of the surface.
         segments: faces around.
-        squash: scale of the extent along z.
+        open_ended: whether the inside can be seen and so needs a surface.
     """
     outline = np.asarray(profile, dtype=np.float64)
     angle = np.arange(segments + 1) * (2 * np.pi / segments)
     points = np.empty((len(outline), segments + 1, 3))
     points[..., 0] = outline[:, :1] * np.sin(angle) + centre[0]
     points[..., 1] = outline[:, 1:] + centre[1]
-    points[..., 2] = outline[:, :1] * np.cos(angle) * squash + centre[2]
+    points[..., 2] = outline[:, :1] * np.cos(angle) + centre[2]
     path = np.concatenate([[0.0], np.cumsum(np.sqrt((np.diff(outline, axis=0) ** 2).sum(axis=1)))])
     turns = max(1, round(2 * np.pi * float(outline[:, 0].max()) / material.width_m))
     u, v = np.meshgrid(angle / (2 * np.pi) * turns, path / material.height_m)
-    return sheet(points, np.stack([u, v], axis=-1), material)
+    return sheet(points, np.stack([u, v], axis=-1), material, both_sides=open_ended)
 
 
 def cylinder(
@@ -296,7 +308,7 @@ def cylinder(
 ) -> list[Surface]:
     """An upright cylinder with sharp rims between two heights above its foot, metres."""
     lid = lathe([(0.0005, top), (radius, top)], centre, material, segments=segments)
-    side = lathe([(radius, top), ((radius), bottom)], centre, material, segments=segments)
+    side = lathe([(radius, top), (radius, bottom)], centre, material, segments=segments)
     base = lathe([(radius, bottom), (0.0005, bottom)], centre, material, segments=segments)
     return lid + side + base
 

@@ -47,7 +47,7 @@ def table_lamp(kit: Kit, dice: Dice) -> list[Surface]:
         [(0.012, 0.3), (0.02, 0.24), (0.06, 0.16), (0.075, 0.09), (0.05, 0.02), (0.06, 0.0)], (0, 0, 0),
         dice.pick(kit.ceramics), segments=10,
     )  # fmt: skip
-    return made + lathe([(0.09, 0.46), (0.15, 0.26)], (0, 0, 0), kit.lampshade, segments=14)
+    return made + lathe([(0.09, 0.46), (0.15, 0.26)], (0, 0, 0), kit.lampshade, segments=14, open_ended=True)
 
 
 def coffee_table(kit: Kit, dice: Dice) -> Piece:

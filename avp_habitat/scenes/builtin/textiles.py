@@ -8,6 +8,7 @@ from avp_habitat.scenes.builtin.noise import (
     Colour,
     Field,
     coordinates,
+    cosine_of_multiple,
     fractal,
     mix,
     plain,
@@ -63,8 +64,8 @@ def _ikat(u: Field, v: Field) -> list[Field]:
 
 def _sprigs(u: Field, v: Field) -> list[Field]:
     local_u, local_v = (u * 5) % 1 * 2 - 1, (v * 5 + np.float32(0.5) * (np.floor(u * 5) % 2)) % 1 * 2 - 1
-    angle, radius = np.arctan2(local_v, local_u), np.sqrt(local_u * local_u + local_v * local_v)
-    flower = step(-radius + 0.42 + 0.2 * np.cos(6 * angle), 0, 0.08)
+    radius = np.sqrt(local_u * local_u + local_v * local_v)
+    flower = step(-radius + 0.42 + 0.2 * cosine_of_multiple(local_u, local_v, 6), 0, 0.08)
     return [flower, step(-radius, -0.17, 0.06)]
 
 
