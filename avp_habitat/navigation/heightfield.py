@@ -85,10 +85,12 @@ def _cut(polygon, count, axis, limit, below, above):
                 below[low, k] = above[high, k] = polygon[j, k] + (polygon[i, k] - polygon[j, k]) * share
             low, high = low + 1, high + 1
         if side >= 0:
-            below[low] = polygon[i]
+            for k in range(3):
+                below[low, k] = polygon[i, k]
             low += 1
         if side <= 0:
-            above[high] = polygon[i]
+            for k in range(3):
+                above[high, k] = polygon[i, k]
             high += 1
     return low, high
 
@@ -96,7 +98,9 @@ def _cut(polygon, count, axis, limit, below, above):
 @njit(cache=True)
 def _grown(array):
     bigger = np.empty((2 * array.shape[0], array.shape[1]), array.dtype)
-    bigger[: array.shape[0]] = array
+    for i in range(array.shape[0]):
+        for k in range(array.shape[1]):
+            bigger[i, k] = array[i, k]
     return bigger
 
 
@@ -169,14 +173,16 @@ def _rasterise(vertices, triangles, level_enough, low, high, cell, level, rows, 
     rest, row, spare = np.empty((12, 3), np.float32), np.empty((12, 3), np.float32), np.empty((12, 3), np.float32)
     piece = np.empty((12, 3), np.float32)
     per_metre = np.float32(1) / cell
+    # Typed numbers: a literal would make the compiler compile every callee once more.
+    three, along_z = np.int64(3), np.int64(2)
     for t in range(len(triangles)):
-        for k in range(3):
-            rest[k] = vertices[triangles[t, k]]
-        left = 3
-        start, end = _extent(rest, 3, 2, low[2], per_metre, rows)
+        for k in range(9):
+            rest[k // 3, k % 3] = vertices[triangles[t, k // 3], k % 3]
+        left = three
+        start, end = _extent(rest, left, along_z, low[2], per_metre, rows)
         for z in range(start, end + 1):
             limit = low[2] + np.float32(z) * cell + cell
-            in_row, left = _cut(rest, left, 2, limit, row, spare)
+            in_row, left = _cut(rest, left, along_z, limit, row, spare)
             rest, spare = spare, rest
             if in_row >= 3 and z >= 0:
                 column_heads = head[z * columns : (z + 1) * columns]
@@ -190,10 +196,11 @@ def _rasterise(vertices, triangles, level_enough, low, high, cell, level, rows, 
 @njit(cache=True)
 def _fill_row(head, pool, state, row, in_row, piece, spare, low, high, cell, level, walkable, climb):
     """Cut a triangle's piece in one row of columns into columns; returns the pool, which may have moved."""
-    start, end = _extent(row, in_row, 0, low[0], np.float32(1) / cell, len(head))
+    along_x = np.int64(0)
+    start, end = _extent(row, in_row, along_x, low[0], np.float32(1) / cell, len(head))
     for x in range(start, end + 1):
         limit = low[0] + np.float32(x) * cell + cell
-        count, in_row = _cut(row, in_row, 0, limit, piece, spare)
+        count, in_row = _cut(row, in_row, along_x, limit, piece, spare)
         row, spare = spare, row
         if count < 3 or x < 0:
             continue

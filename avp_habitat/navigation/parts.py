@@ -91,14 +91,15 @@ def _border_distance(neighbour):
     count = len(neighbour)
     distance = np.full(count, _FAR, np.int64)
     for i in range(count):
-        if neighbour[i].min() < 0:
-            distance[i] = 0
+        for direction in range(4):
+            if neighbour[i, direction] < 0:
+                distance[i] = 0
     for i in range(count):
-        _relax(distance, neighbour, i, 0, 3)
-        _relax(distance, neighbour, i, 3, 2)
+        for direction in (0, 3):
+            _relax(distance, neighbour, i, direction, (direction + 3) % 4)
     for i in range(count - 1, -1, -1):
-        _relax(distance, neighbour, i, 2, 1)
-        _relax(distance, neighbour, i, 1, 0)
+        for direction in (2, 1):
+            _relax(distance, neighbour, i, direction, (direction + 3) % 4)
     return distance
 
 
