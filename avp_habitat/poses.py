@@ -54,7 +54,7 @@ class Intrinsics:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
 
-def camera_to_world(position: Float, *, yaw: Float, pitch: Float) -> Float:
+def camera_to_world(position: Float, *, yaw: Float, pitch: Float) -> NDArray[np.float64]:
     """Poses of upright cameras (no roll), habitat axes.
 
     Args:
@@ -83,7 +83,7 @@ def yaw_and_pitch(pose: Float) -> tuple[Float, Float]:
     return np.arctan2(-forward[..., 0], -forward[..., 2]), np.arcsin(np.clip(forward[..., 1], -1.0, 1.0))
 
 
-def heading(yaw: Float) -> Float:
+def heading(yaw: Float) -> NDArray[np.float64]:
     """`(n, 3)` unit vectors on the floor along which agents with `(n,)` yaw angles in radians walk."""
     yaw = np.asarray(yaw, dtype=np.float64)
     return np.stack([-np.sin(yaw), np.zeros_like(yaw), -np.cos(yaw)], axis=-1)

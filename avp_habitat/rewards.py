@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from avp_habitat.errors import unknown_name
 
 Float = NDArray[np.floating]
+Number = NDArray[np.number]
 Bool = NDArray[np.bool_]
 
 PARTS = ("coverage", "spread", "step", "collision", "redundancy", "stop")
@@ -55,11 +56,11 @@ class RewardConstants:
 class StepFacts:
     """What happened to n agents in one step; every array is `(n,)`."""
 
-    new_cells: Float
+    new_cells: Number
     """Δc: navigable cells first observed by this step's view."""
-    earlier_visits: Float
+    earlier_visits: Number
     """v: earlier views taken from the agent's cell."""
-    spread_m: Float
+    spread_m: Number
     """‖p − p̄‖ in metres on the floor plane; p̄ is the mean of the positions visited so far."""
     collided: Bool
     """Forward was chosen and the agent moved less than 0.05 m."""
@@ -67,23 +68,23 @@ class StepFacts:
     """An earlier view lies within d_red and both its angles within δ."""
     stop_chosen: Bool
     """The stop action was chosen, and this reward has one."""
-    coverage: Float
+    coverage: Number
     """C after the step."""
-    steps_left: Float
+    steps_left: Number
     """T − t after the step."""
 
 
-def _coverage(facts: StepFacts, constants: RewardConstants) -> dict[str, Float]:
+def _coverage(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """Eq. 24: α·Δc − P_collision."""
     return {"coverage": constants.alpha * facts.new_cells, "collision": -constants.collision * facts.collided}
 
 
-def _coverage_redundancy(facts: StepFacts, constants: RewardConstants) -> dict[str, Float]:
+def _coverage_redundancy(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """Eq. 25: α·Δc + λ_s·min(‖p − p̄‖, r_max) − P_redundancy − P_collision."""
     return _coverage(facts, constants) | _dispersion(facts, constants)
 
 
-def _proposed(facts: StepFacts, constants: RewardConstants) -> dict[str, Float]:
+def _proposed(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """Eq. 19–22: sublinear, visit-discounted coverage with dispersion, step cost and a learned stop."""
     discount = constants.alpha_proposed / (1 + constants.visit_decay * facts.earlier_visits)
     success = constants.stop_bonus + constants.stop_per_step_left * facts.steps_left
@@ -96,14 +97,14 @@ def _proposed(facts: StepFacts, constants: RewardConstants) -> dict[str, Float]:
     }
 
 
-def _dispersion(facts: StepFacts, constants: RewardConstants) -> dict[str, Float]:
+def _dispersion(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     return {
         "spread": constants.spread * np.minimum(facts.spread_m, constants.spread_limit_m),
         "redundancy": -constants.redundancy * facts.redundant,
     }
 
 
-_REWARDS: dict[str, Callable[[StepFacts, RewardConstants], dict[str, Float]]] = {
+_REWARDS: dict[str, Callable[[StepFacts, RewardConstants], dict[str, Number]]] = {
     "coverage": _coverage,
     "coverage_redundancy": _coverage_redundancy,
     "proposed": _proposed,
@@ -133,7 +134,7 @@ def stops_episode(facts: StepFacts, constants: RewardConstants) -> Bool:
     return facts.stop_chosen & (facts.coverage >= constants.stop_coverage)
 
 
-def reward_parts(name: str, facts: StepFacts, constants: RewardConstants) -> dict[str, Float]:
+def reward_parts(name: str, facts: StepFacts, constants: RewardConstants) -> dict[str, NDArray[np.float64]]:
     """The parts of a reward, `(n,)` each, in the order of `PARTS`; the reward is their sum.
 
     Args:

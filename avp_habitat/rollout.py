@@ -156,6 +156,7 @@ def _count(folder: Path, meta: dict[str, Any], key: str) -> int:
 def _intrinsics(path: Path, meta: dict[str, Any]) -> Intrinsics:
     camera = _of(meta, "camera")
     values: dict[str, Any] = {}
+    value: Any
     for name, kind in (("width", int), ("height", int), ("fx", float), ("fy", float), ("cx", float), ("cy", float)):
         value = camera.get(name)
         usable = isinstance(value, (int, float)) and not isinstance(value, bool) and np.isfinite(value) and value > 0

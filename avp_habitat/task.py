@@ -86,7 +86,7 @@ class ViewpointTask:
         """`(n, 4, 4)` the sensors' poses now, habitat axes."""
         return self._sensor_poses(self.position, self.yaw, self.pitch)
 
-    def reset(self, rows: Sequence[int], position: Float, yaw: Float) -> NDArray[np.float32]:
+    def reset(self, rows: Sequence[int] | NDArray[np.integer], position: Float, yaw: Float) -> NDArray[np.float32]:
         """Start new episodes of some agents, looking straight ahead.
 
         Args:
@@ -97,7 +97,7 @@ class ViewpointTask:
         Returns:
             `(len(rows), 12)` first observations; their views are not captured and observe nothing.
         """
-        rows = np.asarray(rows)
+        rows = np.asarray(rows, dtype=np.int64)
         self.position[rows], self.yaw[rows], self.pitch[rows] = position, poses.wrap_angle(yaw), 0.0
         self.steps[rows], self.first_seen[rows], self._collided[rows] = 0, 0, False
         self._path[rows, 0] = position
@@ -261,7 +261,9 @@ class ViewpointTask:
             spread=self._spread(rows) / radius,
         )
 
-    def _record(self, actions: NDArray[np.integer], reward: Float, parts: dict[str, Float], facts: StepFacts) -> None:
+    def _record(
+        self, actions: NDArray[np.integer], reward: Float, parts: dict[str, NDArray[np.float64]], facts: StepFacts
+    ) -> None:
         columns = {
             "action": actions,
             "reward": reward,

@@ -225,7 +225,7 @@ def _commit() -> str | None:
 
 def _open(argv: Sequence[str]) -> Demo:
     parser = argparse.ArgumentParser(
-        description=__doc__.split("\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+        description="The whole chain on one room.", formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
     parser.add_argument("--out", default=Path("runs/demo"), type=Path, help="folder of the results")
     for name, value in asdict(Settings()).items():

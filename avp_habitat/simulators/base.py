@@ -31,8 +31,11 @@ class Simulator(Protocol):
     """What the user called the scene, without folders: a file's name or `builtin:SEED`."""
     scene_digest: str
     """Hexadecimal SHA-256 of the scene's content."""
-    area: NavigableArea
-    """Where agents can stand."""
+
+    @property
+    def area(self) -> NavigableArea:
+        """Where agents can stand."""
+        ...
 
     def render(self, camera_to_world: NDArray[np.floating], intrinsics: Intrinsics, *, rgb: bool) -> Frames:
         """Depth, and colour when asked for, of `(n, 4, 4)` habitat poses."""

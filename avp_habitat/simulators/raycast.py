@@ -34,13 +34,17 @@ class RaycastSimulator:
         self._mesh = scene.mesh
         self._rays = _Rays(scene.mesh.vertices, scene.mesh.triangles)
 
-    @cached_property
+    @property
     def area(self) -> "NavigableArea":
         """Where agents can stand; computed when first asked for.
 
         Raises:
             SceneError: the scene has no floor on which an agent can stand.
         """
+        return self._area
+
+    @cached_property
+    def _area(self) -> "NavigableArea":
         from avp_habitat.navigation.area import build_area
 
         return build_area(self._mesh, self.surface_below)
