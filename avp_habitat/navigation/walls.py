@@ -1,7 +1,7 @@
 """The walls of an outline in a grid of bins, so that a straight line meets only the walls near it.
 
-Kernels of `motion` and `geodesic` contain compiled copies of these: after a change here, touch those files too, or numba
-keeps their cached versions.
+Kernels of `motion` and `geodesic` contain compiled copies of these: after a change here, touch those files too, or
+numba keeps their cached versions.
 """
 
 from typing import NamedTuple
