@@ -3,9 +3,6 @@
 from dataclasses import dataclass
 
 import torch
-
-from avp_nerfstudio.dataparser import AVPDataParserConfig
-from avp_nerfstudio.model import AVPNerfactoModelConfig
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
@@ -13,6 +10,9 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+
+from avp_nerfstudio.dataparser import AVPDataParserConfig
+from avp_nerfstudio.model import AVPNerfactoModelConfig
 
 ITERATIONS = 1500
 

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+from nerfstudio.data.scene_box import SceneBox
 from numpy.typing import NDArray
 
 from avp_habitat.errors import RolloutError
 from avp_habitat.images import DEPTH_UNIT_M, read_depth
 from avp_habitat.poses import Intrinsics, unproject, y_up_to_z_up
 from avp_habitat.rollout import Rollout, View, read_rollout
-from nerfstudio.cameras.cameras import Cameras, CameraType
-from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
-from nerfstudio.data.scene_box import SceneBox
 
 _DEPTHS_FOR_BOX = 24
 _PIXEL_STRIDE = 8

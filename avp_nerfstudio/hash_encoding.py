@@ -5,10 +5,9 @@ from typing import Any
 import numba
 import numpy as np
 import torch
+from nerfstudio.field_components.encodings import HashEncoding
 from numpy.typing import NDArray
 from torch import Tensor, nn
-
-from nerfstudio.field_components.encodings import HashEncoding
 
 # Primes of the spatial hash (Müller et al., Instant Neural Graphics Primitives, 2022, Eq. 4), as nerfstudio has them.
 _PRIME_Y = 2654435761

@@ -8,9 +8,8 @@ from typing import Any
 
 import torch
 import torchmetrics.image.lpip
-from torch import Tensor, nn
-
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor, nn
 
 WEIGHTS = "alexnet-owt-7be5be79.pth"
 _DOWNLOAD_TIMEOUT_S = 5.0
@@ -77,7 +76,7 @@ _TorchmetricsLPIPS = torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilari
 
 @contextlib.contextmanager
 def optional_lpips() -> Iterator[None]:
-    """Within this context nerfacto makes an `OptionalLPIPS` where it would make torchmetrics' (it has no hook for it)."""
+    """Within it nerfacto makes an `OptionalLPIPS` where it would make torchmetrics' LPIPS; it has no hook for that."""
     torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity = OptionalLPIPS  # type: ignore[misc]
     try:
         yield

@@ -4,14 +4,13 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.model_components.scene_colliders import AABBBoxCollider
+from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 from torch import Tensor
 
 from avp_nerfstudio.hash_encoding import compile_hash_encodings
 from avp_nerfstudio.lpips import optional_lpips
-from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.model_components.scene_colliders import AABBBoxCollider
-from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 
 
 @dataclass
@@ -49,7 +48,7 @@ class AVPNerfactoModel(NerfactoModel):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """nerfacto's metrics of a picture, without `lpips` where LPIPS is not computed."""
+        """Nerfacto's metrics of a picture, without `lpips` where LPIPS is not computed."""
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         if math.isnan(metrics["lpips"]):
             del metrics["lpips"]

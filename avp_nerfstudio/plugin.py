@@ -25,8 +25,9 @@ class Unavailable:
 
 
 def _data() -> Any:
-    from avp_nerfstudio.dataparser import AVPDataParserConfig
     from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+
+    from avp_nerfstudio.dataparser import AVPDataParserConfig
 
     return DataParserSpecification(
         config=AVPDataParserConfig(), description="A rollout of the AVP suite: metric poses, held-out views for eval."

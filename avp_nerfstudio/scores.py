@@ -39,12 +39,11 @@ def read_scores(path: str | Path, *, lpips_reason: str | None = None) -> Scores:
     """
     path = Path(path)
     results = _results(path)
-    lpips = results.get("lpips")
-    computed = lpips is not None and math.isfinite(lpips)
+    computed = "lpips" in results
     return Scores(
         psnr=_number(path, results, "psnr"),
         ssim=_number(path, results, "ssim"),
-        lpips=float(lpips) if computed else None,
+        lpips=_number(path, results, "lpips") if computed else None,
         lpips_reason=None if computed else lpips_reason or "ns-eval did not compute it; its output says why",
     )
 

@@ -1,0 +1,42 @@
+import json
+
+import pytest
+
+from avp_nerfstudio.scores import Scores, ScoresError, read_scores
+
+
+def write(path, results):
+    path.write_text(json.dumps({"method_name": "avp-nerfacto", "results": results}))
+    return path
+
+
+def test_all_three_scores_are_read(tmp_path):
+    path = write(tmp_path / "s.json", {"psnr": 25.5, "psnr_std": 2, "ssim": 0.9, "lpips": 0.04, "fps": 1.0})
+    assert read_scores(path) == Scores(psnr=25.5, ssim=0.9, lpips=0.04, lpips_reason=None)
+
+
+def test_lpips_that_was_not_computed_is_none_with_a_reason(tmp_path):
+    path = write(tmp_path / "s.json", {"psnr": 25.5, "ssim": 0.9})
+    assert read_scores(path).lpips is None
+    assert "did not compute it" in str(read_scores(path).lpips_reason)
+    assert read_scores(path, lpips_reason="no weights").lpips_reason == "no weights"
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (None, "found no such file"),
+        ("{", "could not read it"),
+        ("[]", "found none of its `results`"),
+        ('{"results": 3}', "expected `results` to be an object"),
+        ('{"results": {"psnr": 20}}', "finite number for ssim, found None"),
+        ('{"results": {"psnr": NaN, "ssim": 1}}', "finite number for psnr, found nan"),
+    ],
+)
+def test_a_file_that_is_not_ns_evals_is_an_error_that_names_it(tmp_path, content, text):
+    path = tmp_path / "s.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(ScoresError, match=text) as error:
+        read_scores(path)
+    assert str(path) in str(error.value)
