@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
 from avp_habitat.navigation.area import Float, NavigableArea, SurfaceBelow
-from avp_habitat.navigation.boundary import outline
+from avp_habitat.navigation.boundary import largest_piece, outline
 from avp_habitat.navigation.filters import standing_places
 from avp_habitat.navigation.heightfield import Heightfield, level_triangles, voxelise
 from avp_habitat.navigation.parts import Part, common_place, connected_parts, lay_flat, main_part, place_near
@@ -94,16 +94,60 @@ def _with_floor(
     z = origin[1] + (np.arange(rows) + 0.5) * cell
     centres = np.stack(np.meshgrid(x, z), axis=-1)
     mask = _stands_clear(make_walls(rings), centres.reshape(-1, 2)).reshape(rows, columns)
-    if not mask.any():
-        raise SceneError(f"the navigable area is smaller than one cell of {cell:g} m; is the scene not in metres?")
     voxel_floor = np.where(flat.inside, low[1] + flat.floor * settings.voxel_height_m, np.nan)
     above = continued(voxel_floor, _REACH_CELLS, np.fmax)[::stride, ::stride][mask]
-    top = np.nan_to_num(above, nan=float(np.nanmax(voxel_floor))) + settings.climb_voxels * settings.voxel_height_m
-    found = surface_below(np.stack([centres[mask][:, 0], top, centres[mask][:, 1]], axis=1))
-    depth = top - np.asarray(found, dtype=np.float64)
+    top = np.nan_to_num(above, nan=float(np.nanmax(voxel_floor)))
+    return _over_cells(rings, origin, mask, top, surface_below, settings)
+
+
+def area_in_outline(triangles: Float, surface_below: SurfaceBelow, settings: NavigationSettings) -> NavigableArea:
+    """The navigable area of a navigation mesh that was made elsewhere, on the scene's true floor.
+
+    Args:
+        triangles: `(k, 3, 3)` corners in metres, world frame, of one connected navigation mesh; heights may lie above
+            the floor by what their maker rounded up.
+        surface_below: casts rays straight down on the scene's mesh.
+        settings: of the cells.
+
+    Raises:
+        SceneError: the mesh is smaller than one cell, or no ray meets the floor.
+    """
+    import shapely
+    from scipy.spatial import KDTree
+
+    shapes = shapely.polygons(triangles[:, :, [0, 2]])
+    # Neighbours share corners only up to rounding; a seam would cut the area in two.
+    rings = largest_piece(shapely.union_all(shapely.buffer(shapes, SKIN_M, join_style="mitre")))
+    low, high = rings[0].min(axis=0), rings[0].max(axis=0)
+    columns, rows = np.ceil((high - low) / settings.cell_m).astype(int)
+    x = low[0] + (np.arange(columns) + 0.5) * settings.cell_m
+    z = low[1] + (np.arange(rows) + 0.5) * settings.cell_m
+    centres = np.stack(np.meshgrid(x, z), axis=-1)
+    mask = _stands_clear(make_walls(rings), centres.reshape(-1, 2)).reshape(rows, columns)
+    corners = triangles.reshape(-1, 3)
+    nearest = KDTree(corners[:, [0, 2]]).query(centres[mask])[1] if mask.any() else []
+    return _over_cells(rings, low, mask, corners[nearest, 1], surface_below, settings)
+
+
+def _over_cells(
+    rings: list[Float],
+    origin: Float,
+    mask: NDArray[np.bool_],
+    floor: Float,
+    surface_below: SurfaceBelow,
+    settings: NavigationSettings,
+) -> NavigableArea:
+    """The area whose navigable cells have these `(m,)` floor heights, each made true by a ray from a step above."""
+    cell = max(1, round(settings.cell_m / settings.voxel_m)) * settings.voxel_m
+    if not mask.any():
+        raise SceneError(f"the navigable area is smaller than one cell of {cell:g} m; is the scene not in metres?")
+    rows, columns = np.nonzero(mask)
+    x, z = origin[0] + (columns + 0.5) * cell, origin[1] + (rows + 0.5) * cell
+    top = floor + settings.climb_voxels * settings.voxel_height_m
+    found = np.asarray(surface_below(np.stack([x, top, z], axis=1)), dtype=np.float64)
     deepest = (2 * settings.climb_voxels + 1) * settings.voxel_height_m + SKIN_M
     heights = np.full(mask.shape, np.nan)
-    heights[mask] = np.where((depth >= 0) & (depth <= deepest), found, np.nan)
+    heights[mask] = np.where((top - found >= 0) & (top - found <= deepest), found, np.nan)
     if not np.isfinite(heights).any():
         raise SceneError("no ray meets the floor below the navigable cells: the mesh and its ray caster disagree")
     heights = continued(heights, _REACH_CELLS, np.fmin)
