@@ -162,7 +162,7 @@ def test_a_model_of_another_environment_is_refused(tmp_path, capfd):
 )
 def test_wrong_input_is_one_line_with_its_exit_code(tmp_path, capfd, change, code, words):
     options = {"--scene": "builtin:0", "--policy": "random", "--out": tmp_path / "r"} | change
-    assert collect(*[word for pair in options.items() for word in pair], *SMALL) == code
+    assert collect(*SMALL, *[word for pair in options.items() for word in pair]) == code
     error = capfd.readouterr().err.strip().splitlines()[-1]
     assert re.search(words, error), error
     assert error.startswith("error: ")
