@@ -135,24 +135,22 @@ def working(kit: Kit, dice: Dice) -> Arrange:
     table, stool = tables.desk(kit, dice), seating.office_chair(kit, dice)
     z = GAP_M + table.depth / 2
     group = Group(
-        (Member(table, 0.0, z), Member(stool, -0.1, GAP_M + table.depth + 0.36, 2, dice.number(-0.4, 0.4))),
+        (Member(table, 0.0, z), Member(stool, -0.1, GAP_M + table.depth + 0.42, 2, dice.number(-0.4, 0.4))),
         ((-0.5, 0.7, 0.5, 1.6),),
     )
     return lambda depth: group if depth > 1.7 else None
 
 
-def reading(kit: Kit, dice: Dice) -> Arrange:
-    """An armchair with a floor lamp and a pouf."""
+def reading(kit: Kit, dice: Dice) -> list[Arrange]:
+    """An armchair with a floor lamp and, where there is room, a pouf."""
     seat, lamp, stool = seating.armchair(kit, dice), decor.floor_lamp(kit, dice), seating.pouf(kit, dice)
     side = dice.pick((-1, 1))
-    group = Group(
-        (
-            Member(seat, 0.0, 0.12 + seat.depth / 2, 0, dice.number(-0.25, 0.25)),
-            Member(lamp, side * (seat.width / 2 + 0.34), 0.3),
-            Member(stool, 0.0, 0.12 + seat.depth + 0.45),
-        )
+    members = (
+        Member(seat, 0.0, 0.12 + seat.depth / 2, 0, dice.number(-0.25, 0.25)),
+        Member(lamp, side * (seat.width / 2 + 0.34), 0.3),
+        Member(stool, 0.0, 0.12 + seat.depth + 0.45),
     )
-    return lambda depth: group if depth > 2.2 else None
+    return [lambda depth, count=count: Group(members[:count]) if depth > 1.8 else None for count in (3, 2)]
 
 
 def divider(kit: Kit, dice: Dice, ceiling: float) -> list[Arrange]:

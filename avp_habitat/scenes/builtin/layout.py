@@ -56,28 +56,45 @@ def _across(floor: Floor, dice: Dice) -> Iterator[Spot]:
 
 
 def _storage(kit: Kit, dice: Dice) -> list[Arrange]:
-    return dice.shuffled(
-        [
-            groups.against_wall(storage.bookshelf(kit, dice), 0.55),
-            groups.against_wall(storage.wardrobe(kit, dice), 0.6),
-            groups.against_wall(storage.drawers(kit, dice), 0.5),
-        ]
-    )
+    """Tall and low furniture for walls, the second shelf and chest last."""
+    first = [
+        groups.against_wall(storage.bookshelf(kit, dice), 0.55),
+        groups.against_wall(storage.wardrobe(kit, dice), 0.6),
+        groups.against_wall(storage.drawers(kit, dice), 0.5),
+    ]
+    second = [
+        groups.against_wall(storage.bookshelf(kit, dice), 0.55),
+        groups.against_wall(storage.drawers(kit, dice), 0.5),
+    ]
+    return dice.shuffled(first) + second
 
 
-def _put_furniture(floor: Floor, dice: Dice, kit: Kit) -> None:
-    """Main groups by the room's size, what parts it, then storage, then what fills corners."""
+def _put_living(floor: Floor, dice: Dice, kit: Kit) -> bool:
+    """Sofa, television and what belongs to them, as much as fits."""
+    return any(_put(floor, arrange, _at_walls(floor, dice), MAIN) for arrange in groups.living(kit, dice))
+
+
+def _put_main_groups(floor: Floor, dice: Dice, kit: Kit) -> None:
+    """What the room is for, by its size, and what parts it."""
     area = floor.shell.floor_area
     sleeps = dice.chance(0.6 if area > 22 else 0.4)
     sits = area > 20 or not sleeps
-    if sits:
-        any(_put(floor, arrange, _at_walls(floor, dice), MAIN) for arrange in groups.living(kit, dice))
-    if sleeps:
-        _put(floor, groups.sleeping(kit, dice), _at_walls(floor, dice), MAIN)
+    sits = sits and _put_living(floor, dice, kit)
+    sleeps = (sleeps or not sits) and _put(floor, groups.sleeping(kit, dice), _at_walls(floor, dice), MAIN)
+    if not sits and not sleeps:
+        sits = _put_living(floor, dice, kit)
     if not (sits and sleeps) or area > 30:
         _put(floor, groups.dining(kit, dice), _anywhere(floor, dice), MAIN)
     any(_put(floor, arrange, _across(floor, dice), MAIN) for arrange in groups.divider(kit, dice, floor.shell.ceiling))
-    for arrange in (groups.working(kit, dice), *_storage(kit, dice), groups.reading(kit, dice)):
+
+
+def _put_the_rest(floor: Floor, dice: Dice, kit: Kit) -> None:
+    """Desk, storage, a place to read, and what fills corners, as long as the floor stays walkable."""
+    first, *rest = _storage(kit, dice)
+    for arrange in (groups.working(kit, dice), first):
+        _put(floor, arrange, _at_walls(floor, dice), EXTRA)
+    any(_put(floor, arrange, _at_walls(floor, dice), EXTRA) for arrange in groups.reading(kit, dice))
+    for arrange in rest:
         _put(floor, arrange, _at_walls(floor, dice), EXTRA)
     for _ in range(2):
         _put(floor, groups.against_wall(decor.plant(kit, dice), 0.0), _in_corners(floor, dice, 0.42), SMALL)
@@ -88,7 +105,8 @@ def _put_furniture(floor: Floor, dice: Dice, kit: Kit) -> None:
 def furnish(shell: Shell, dice: Dice, kit: Kit) -> list[Placed]:
     """Furniture of a room, none of it in another's place, the door free, the floor walkable and in one part."""
     floor = Floor(shell)
-    _put_furniture(floor, dice, kit)
+    _put_main_groups(floor, dice, kit)
+    _put_the_rest(floor, dice, kit)
     hang_lamp(floor, dice, kit)
     hang_pictures(floor, dice, kit)
     return floor.placed

@@ -85,7 +85,7 @@ def office_chair(kit: Kit, dice: Dice) -> Piece:
     made += cushion((0.48, 0.09, 0.46), (0, 0.47, 0), 0.04, kit.second_cloth, puff=0.01)
     made += cushion((0.44, 0.52, 0.08), (0, 0.83, -0.22), 0.035, kit.second_cloth, puff=0.01)
     made += box((0.06, 0.3, 0.03), (0, 0.58, -0.275), kit.black, pitch=1)
-    return Piece("office chair", made, 0.56, 0.56, 1.1)
+    return Piece("office chair", made, 0.58, 0.58, 1.1)
 
 
 def pouf(kit: Kit, dice: Dice) -> Piece:

@@ -134,7 +134,8 @@ def panel(
             open_ |= ((mid_t > top) & (mid_t < bottom))[:, None] & ((mid_s > left) & (mid_s < end))[None]
         triangles = triangles[np.repeat(~open_.ravel(), 2)]
     normal = _unit(np.cross(fall, across))
-    vertices = points.reshape(-1, 3)
+    used, triangles = np.unique(triangles, return_inverse=True)
+    vertices, uv, triangles = points.reshape(-1, 3)[used], uv[used], triangles.reshape(-1, 3).astype(np.int32)
     return Surface(vertices, np.broadcast_to(normal, vertices.shape).copy(), uv, triangles, material)
 
 

@@ -145,11 +145,13 @@ def plan_shell(dice: Dice) -> Shell:
     """A rectangular or L-shaped room with one door and one to three windows on other walls."""
     corners, notch = _outline(dice)
     ceiling = dice.number(2.5, 3.2)
-    walls = Shell(corners, notch, ceiling, ()).walls
+    shell = Shell(corners, notch, ceiling, ())
+    walls = shell.walls
     order = dice.shuffled([index for index, wall in enumerate(walls) if wall.length >= 2.4])
     door_wall = walls[order[0]]
     left = 0.3 if dice.chance(0.5) else round(door_wall.length - 1.2, 2)
     openings = [Opening(order[0], left, round(left + 0.9, 2), 0.0, 2.05, "door")]
-    for index in order[1 : 2 + dice.whole(1, 2)]:
+    windows = dice.whole(1, 2) if shell.floor_area < 24 else dice.whole(2, 3)
+    for index in order[1 : 1 + windows]:
         openings.append(_window(dice, index, walls[index].length, ceiling))
     return Shell(corners, notch, ceiling, tuple(openings))

@@ -90,7 +90,7 @@ def wardrobe(kit: Kit, dice: Dice) -> Piece:
             made += box((each - 0.16, tall, 0.01), (x, y, depth / 2 - 0.013), body, pitch=0.5)
         side = 1 if door % 2 == 0 else -1
         made += box(
-            (0.018, 0.16, 0.02), (x + side * (each / 2 - 0.045), high * 0.5, depth / 2 - 0.008), kit.metal, pitch=1
+            (0.018, 0.16, 0.02), (x + side * (each / 2 - 0.045), high * 0.5, depth / 2 - 0.012), kit.metal, pitch=1
         )
     if dice.chance(0.6):
         made += box((0.5, 0.22, 0.36), (-width * 0.2, high + 0.11, -0.05), kit.wicker)

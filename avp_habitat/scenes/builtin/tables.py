@@ -68,7 +68,7 @@ def coffee_table(kit: Kit, dice: Dice) -> Piece:
         made += shifted(book_stack(kit, dice), -width * 0.2, 0.171, 0)
     made += shifted(book_stack(kit, dice), -width * 0.22, high + 0.001, 0.02)
     made += shifted(bowl(kit, dice) if dice.chance(0.6) else vase(kit, dice, 0.26), width * 0.2, high + 0.001, -0.03)
-    return Piece("coffee table", made, width, depth, high + 0.2)
+    return Piece("coffee table", made, width, depth, high + 0.27)
 
 
 def dining_table(kit: Kit, dice: Dice, width: float, depth: float) -> Piece:
