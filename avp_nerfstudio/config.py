@@ -54,21 +54,22 @@ def trainer_config() -> TrainerConfig:
         machine=MachineConfig(device_type="cuda" if cuda else "cpu"),
         pipeline=VanillaPipelineConfig(
             datamanager=VanillaDataManagerConfig(
-                dataparser=AVPDataParserConfig(), train_num_rays_per_batch=1024, eval_num_rays_per_batch=1024
+                dataparser=AVPDataParserConfig(), train_num_rays_per_batch=512, eval_num_rays_per_batch=1024
             ),
             model=AVPNerfactoModelConfig(
                 implementation="tcnn" if cuda else "torch",
                 eval_num_rays_per_chunk=1 << 13,
                 num_levels=8,
                 max_res=512,
-                log2_hashmap_size=17,
+                log2_hashmap_size=16,
                 hidden_dim=64,
                 hidden_dim_color=64,
                 num_nerf_samples_per_ray=24,
                 num_proposal_samples_per_ray=(64,),
                 num_proposal_iterations=1,
+                proposal_initial_sampler="uniform",
                 proposal_net_args_list=[
-                    {"hidden_dim": 16, "log2_hashmap_size": 15, "num_levels": 4, "max_res": 64, "use_linear": False}
+                    {"hidden_dim": 16, "log2_hashmap_size": 15, "num_levels": 5, "max_res": 128, "use_linear": False}
                 ],
                 proposal_warmup=500,
                 proposal_weights_anneal_max_num_iters=100,
