@@ -7,20 +7,23 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter, maximum_filter, uniform_filter, zoom
 
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics, camera_to_world
 from avp_habitat.scenes.builtin import generate_room, plan_room
 from avp_habitat.scenes.builtin.dice import Dice
+from avp_habitat.scenes.builtin.kit import Kit
 from avp_habitat.scenes.builtin.noise import fractal
 from avp_habitat.scenes.builtin.piece import FLAT_M
-from avp_habitat.scenes.builtin.shapes import box, cushion, cylinder, lathe
+from avp_habitat.scenes.builtin.shapes import Material, box, cushion, cylinder, lathe
 from avp_habitat.scenes.builtin.walkway import largest_part
 from avp_habitat.scenes.loader import Scene
 from avp_habitat.simulators.raycast import RaycastSimulator
 
 MANY = range(20)
 FEW = (0, 1, 9)
+PLAIN = Material(lambda: np.full((64, 64, 3), 200, np.uint8), 1.0, 1.0)
 
 
 @cache
@@ -279,6 +282,29 @@ def test_a_room_with_plain_surfaces_would_have_too_few_corners():
     assert share_of_corners(poor) < 0.4
 
 
+def keypoints_per_square_metre(material, distance_m):
+    """Extrema of differences of Gaussians above SIFT's threshold, for a focal length of 320 pixels."""
+    grey = material.picture.astype(float).mean(axis=-1) * 0.75
+    wanted = np.array([material.height_m, material.width_m]) * 320 / distance_m
+    ratio = wanted.astype(int) / grey.shape
+    smooth = uniform_filter(grey, np.maximum(1, np.rint(1 / ratio)), mode="wrap")
+    seen = zoom(smooth, ratio, order=1, mode="grid-wrap", grid_mode=True)
+    levels = np.stack([gaussian_filter(seen, 1.2 * 2 ** (k / 3), mode="wrap") for k in range(8)])
+    difference = np.abs(np.diff(levels, axis=0))
+    peaks = (difference == maximum_filter(difference, 3)) & (difference > 0.04 / 3 * 255)
+    return peaks[1:-1].sum() / (material.width_m * material.height_m)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("name", ["wall", "papered_wall", "feature_wall", "ceiling", "floor", "upholstery"])
+def test_large_surfaces_have_keypoints(seed, name):
+    assert keypoints_per_square_metre(getattr(Kit(seed), name), 1.5) > 5
+
+
+def test_a_uniform_surface_has_no_keypoints():
+    assert keypoints_per_square_metre(PLAIN, 2.0) == 0
+
+
 @pytest.mark.parametrize("seed", FEW)
 def test_light_is_baked_without_black_corners(seed):
     mesh = room(seed)
@@ -299,8 +325,8 @@ def test_a_seed_that_is_no_natural_number_is_refused(seed):
 @pytest.mark.parametrize(
     "surfaces",
     [
-        box((1, 2, 0.5), (0, 1, 0), None, fit=(0, 0, 1, 1), pitch=0.4),
-        box((0.2, 0.1, 0.3), (0, 1, 0), None, fit=(0, 0, 1, 1)),
+        box((1, 2, 0.5), (0, 1, 0), PLAIN, fit=(0, 0, 1, 1), pitch=0.4),
+        box((0.2, 0.1, 0.3), (0, 1, 0), PLAIN, fit=(0, 0, 1, 1)),
     ],
     ids=["subdivided box", "small box"],
 )
@@ -309,8 +335,6 @@ def test_normals_and_windings_of_boxes_agree_and_point_outwards(surfaces):
 
 
 def test_normals_and_windings_of_round_shapes_agree_and_point_outwards():
-    from avp_habitat.scenes.builtin.kit import Kit
-
     wood = Kit(0).wood
     check_outwards(cushion((0.6, 0.2, 0.4), (0, 1, 0), 0.05, wood, puff=0.02), np.array([0, 1, 0]))
     check_outwards(cylinder(0.2, 0.0, 0.6, (0, 0, 0), wood), np.array([0, 0.3, 0]))

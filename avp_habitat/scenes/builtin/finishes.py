@@ -33,18 +33,26 @@ def _grain(dice: Dice, size: tuple[int, int], rings: float) -> Field:
     return 0.45 * ring * ring + 0.35 * fibre + 0.35 * pores + 0.15 * fractal(dice, size, (24, 6), 2)
 
 
+def _ticks(dice: Dice, size: tuple[int, int]) -> Field:
+    """`(height, width)` short dark strokes along u, as the rays of oak, 1 inside."""
+    return step(value_noise(dice, size, (size[0] // 5, size[1] // 22)), 0.93, 0.06)
+
+
 def wood(dice: Dice, colour: Colour) -> Picture:
     """A wooden face of 1.2 m x 0.6 m, grain along u, with a few knots."""
     size = (256, 512)
     u, v = coordinates(size)
-    dark = _grain(dice, size, 14)
-    for _ in range(3):
-        du = (u - dice.number(0.1, 0.9)) * 2.2
-        dv = (v - dice.number(0.1, 0.9)) * 4
+    dark = _grain(dice, size, 14) * 0.9
+    for index in range(14):
+        spread = 0.2 if index < 4 else 0.07
+        du = (u - dice.number(0.05, 0.95)) * 2.2
+        dv = (v - dice.number(0.05, 0.95)) * 3.2
         distance = np.sqrt(du * du + dv * dv)
-        near = np.clip(1 - distance / 0.22, 0, 1)
-        dark = dark + near * (0.35 + 0.4 * wave(distance * 28))
-    return to_picture(mix(plain(size, shade(colour, 1.12)), shade(colour, 0.52), np.clip(dark, 0, 1)))
+        near = np.clip(1 - distance / spread, 0, 1)
+        dark = dark + near * (0.5 + 0.4 * wave(distance * 28)) + step(-distance, -spread * 0.2, 0.01) * 0.3
+    rgb = mix(plain(size, shade(colour, 1.2)), shade(colour, 0.5), np.clip(dark, 0, 1))
+    rgb = mix(rgb, shade(colour, 1.6), _ticks(dice, size) * 0.5)
+    return to_picture(mix(rgb, shade(colour, 0.36), _ticks(dice, size) * 0.7))
 
 
 def boards(dice: Dice, colour: Colour, rows: int = 12) -> Picture:
@@ -64,7 +72,21 @@ def boards(dice: Dice, colour: Colour, rows: int = 12) -> Picture:
             gap[band] = np.maximum(gap[band], np.abs((u[band] - np.float32(begin) + 0.5) % 1 - 0.5) < 1.6 / 720)
         gap[band.start : band.start + 2] = 1
     rgb = mix(plain(size, shade(colour, 1.08)), shade(colour, 0.55), np.clip(dark, 0, 1)) * tone[..., None]
+    rgb = mix(rgb, shade(colour, 0.3), np.maximum(_ticks(dice, size), _knots(dice, size, 40)) * 0.85)
+    rgb = mix(rgb, shade(colour, 1.35), _ticks(dice, size) * 0.6)
     return to_picture(mix(rgb, shade(colour, 0.28), gap * 0.85))
+
+
+def _knots(dice: Dice, size: tuple[int, int], count: int) -> Field:
+    """`(height, width)` round knots of 1 to 2 cm with rings, 1 in their middle, for boards of 300 pixels a metre."""
+    field = np.zeros(size, np.float32)
+    y, x = np.mgrid[-12:13, -16:17].astype(np.float32)
+    for _ in range(count):
+        distance = np.sqrt((x / dice.number(1.0, 2.0)) ** 2 + y**2) / dice.number(3.0, 6.0)
+        top, left = dice.whole(0, size[0] - 25), dice.whole(0, size[1] - 33)
+        part = field[top : top + 25, left : left + 33]
+        np.maximum(part, np.clip(1.6 - distance, 0, 1) * (0.6 + 0.4 * wave(distance * 2)), out=part)
+    return field
 
 
 def parquet(dice: Dice, colour: Colour) -> Picture:
@@ -84,7 +106,7 @@ def parquet(dice: Dice, colour: Colour) -> Picture:
             block[:, :2] *= 0.6
             turned = (row + column) % 2 == 1
             rgb[row * side :, column * side :][:side, :side] = block.transpose(1, 0, 2) if turned else block
-    return to_picture(rgb)
+    return to_picture(mix(rgb, shade(colour, 0.3), _knots(dice, size, 30) * 0.85))
 
 
 def paint(dice: Dice, colour: Colour) -> Picture:
@@ -93,6 +115,7 @@ def paint(dice: Dice, colour: Colour) -> Picture:
     strokes = fractal(dice, size, (64, 5), 2, 0.8)
     chips = step(value_noise(dice, size, (64, 128)), 0.93, 0.05)
     light = 0.94 + 0.12 * (strokes - 0.5) + 0.08 * (fractal(dice, size, (6, 6), 4) - 0.5) - 0.1 * chips
+    light = light - 0.12 * flakes(dice, size, 24, 0.13) - 0.12 * flakes(dice, size, 50, 0.13)
     return to_picture(plain(size, colour) * light[..., None])
 
 
@@ -133,21 +156,31 @@ def tiles(dice: Dice, colour: Colour, ink: Colour, *, patterned: bool) -> Pictur
     rgb = plain(size, colour)
     if patterned:
         rgb = mix(rgb, ink, _tile_motif(local_u, local_v, dice.whole(0, 2)) * 0.85)
-    rgb = mix(rgb, shade(colour, 0.62), np.clip(fractal(dice, size, (9, 9), 5, 0.7) * 2.4 - 0.9, 0, 1) * 0.6)
+    rgb = mix(rgb, shade(colour, 0.62), np.clip(fractal(dice, size, (9, 9), 5, 0.7) * 2.4 - 0.9, 0, 1) * 0.45)
+    for cells, amount in ((20, 0.3), (48, 0.5)):
+        rgb = mix(rgb, shade(colour, 0.5), flakes(dice, size, cells, 0.18) * amount)
+        rgb = mix(rgb, shade(colour, 1.35), flakes(dice, size, cells, 0.16) * amount)
     rgb *= np.kron(tone, np.ones((side, side), np.float32))[..., None]
     joint = step(np.maximum(np.abs(local_u), np.abs(local_v)), 0.965, 0.015)
     return to_picture(mix(rgb, shade(blend(colour, (0.5, 0.5, 0.5), 0.5), 0.75), joint))
 
 
+def flakes(dice: Dice, size: tuple[int, int], cells: int, share: float) -> Field:
+    """`(height, width)` islands with clear edges, about `cells` to a side, 1 inside; `share` of them are drawn.
+
+    They are what a camera recognises from two places: distinct, irregular, of several sizes.
+    """
+    return step(value_noise(dice, size, (cells, cells)) + 0.12 * value_noise(dice, size, (96, 96)), 1.06 - share, 0.05)
+
+
 def plaster(dice: Dice, colour: Colour) -> Picture:
-    """A painted wall with trowel strokes, mottling and specks, 1.8 m x 1.8 m."""
+    """A painted wall with trowel strokes and flakes of lighter and darker paint, 1.8 m x 1.8 m."""
     size = (512, 512)
     broad = fractal(dice, size, (4, 4), 4)
     strokes = fractal(dice, size, (40, 10), 3, 0.7)
-    crossed = fractal(dice, size, (9, 36), 3, 0.7)
-    grit = value_noise(dice, size, (200, 200))
-    specks = 0.06 * step(grit, 0.9, 0.1) - 0.09 * step(-grit, -0.1, 0.1)
-    light = 0.955 + 0.07 * (broad - 0.5) + 0.13 * (strokes - 0.5) + 0.1 * (crossed - 0.5) + specks
+    light = 0.95 + 0.07 * (broad - 0.5) + 0.1 * (strokes - 0.5)
+    for cells, dark, pale in ((14, 0.05, 0.04), (32, 0.09, 0.05), (70, 0.13, 0.05)):
+        light = light - dark * flakes(dice, size, cells, 0.16) + pale * flakes(dice, size, cells, 0.16)
     return to_picture(plain(size, colour) * light[..., None])
 
 
@@ -163,7 +196,7 @@ def _motif(u: Field, v: Field, kind: int) -> Field:
     if kind == 2:
         return step(-np.abs(np.abs(u) + np.abs(v) - 0.75), -0.09, 0.05) + step(-(np.abs(u) + np.abs(v)), -0.3, 0.05)
     fan = step(-np.abs(wave(radius * 2.5) - 0.5), -0.2, 0.08) * step(-radius, -0.98, 0.04)
-    return fan * step(-v, -0.05, 0.05)
+    return np.maximum(fan, step(-radius, -0.34, 0.05)) * step(-v, -0.05, 0.05)
 
 
 def wallpaper(dice: Dice, colour: Colour, ink: Colour) -> Picture:
@@ -181,6 +214,8 @@ def wallpaper(dice: Dice, colour: Colour, ink: Colour) -> Picture:
         drawn = np.clip(_motif(local_u * scale, local_v * scale, (kind + int(turn * 2)) % 4), 0, 1) * inside
         rgb = mix(rgb, ink, drawn * share)
     paper = 0.95 + 0.12 * (fractal(dice, size, (60, 24), 3, 0.8) - 0.5) + 0.1 * (fractal(dice, size, (5, 5), 3) - 0.5)
+    for cells, dark in ((34, 0.12), (60, 0.14)):
+        paper = paper - dark * flakes(dice, size, cells, 0.14)
     return to_picture(rgb * paper[..., None])
 
 

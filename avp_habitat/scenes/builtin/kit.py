@@ -48,6 +48,19 @@ SCHEMES = (
 )  # fmt: skip
 
 
+def _brightness(colour: Colour) -> float:
+    return 0.3 * colour[0] + 0.59 * colour[1] + 0.11 * colour[2]
+
+
+def legible(ground: Colour, ink: Colour) -> Colour:
+    """The ink, darker where it would hardly show on the ground."""
+    for _ in range(8):
+        if abs(_brightness(ink) - _brightness(ground)) > 0.3:
+            break
+        ink = shade(ink, 0.87)
+    return ink
+
+
 class Kit:
     """Materials of one room, painted when first looked at and the same in whatever order that happens."""
 
@@ -99,12 +112,13 @@ class Kit:
             return Material(partial(finishes.brick, dice, warm), 1.25, 1.2)
         ground = blend(self.scheme.feature, self.scheme.wall, dice.pick((0.0, 0.35, 0.7)))
         ink = blend(self.scheme.wall, self.scheme.feature, 0.1) if dice.chance(0.5) else shade(self.scheme.feature, 0.6)
-        return Material(partial(finishes.wallpaper, dice, ground, ink), 1.2, 1.2)
+        return Material(partial(finishes.wallpaper, dice, ground, legible(ground, ink)), 1.2, 1.2)
 
     @cached_property
     def papered_wall(self) -> Material:
         """A quieter wallpaper in the colour of most walls."""
-        ink = blend(self.scheme.wall, self.scheme.feature, 0.65)
+        ink = blend(self.scheme.wall, self.scheme.feature, 0.85)
+        ink = legible(self.scheme.wall, ink)
         return Material(partial(finishes.wallpaper, self._dice(4), self.scheme.wall, ink), 1.0, 1.0)
 
     @cached_property

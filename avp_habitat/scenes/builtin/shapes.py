@@ -171,7 +171,6 @@ _FACES = {
 """Of each face: its upper left corner, the axes of right and down, and their signs."""
 
 ALL_FACES = tuple(_FACES)
-SIDES_AND_TOP = ("front", "back", "right", "left", "top")
 
 
 def _face_corners(face: str) -> NDArray[np.int64]:

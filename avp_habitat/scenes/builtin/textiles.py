@@ -38,6 +38,9 @@ def weave(dice: Dice, colour: Colour, second: Colour) -> Picture:
     size = (320, 320)
     slubs = step(value_noise(dice, size, (20, 80)), 0.8, 0.1) + step(value_noise(dice, size, (80, 20)), 0.82, 0.1)
     rgb = mix(plain(size, colour), second, np.clip(slubs, 0, 1) * 0.45)
+    for cells, share in ((16, 0.1), (34, 0.13)):
+        rgb = mix(rgb, second, step(value_noise(dice, size, (cells, cells)), 1 - share, 0.06) * 0.6)
+        rgb = mix(rgb, shade(colour, 0.55), step(value_noise(dice, size, (cells, cells)), 1 - share, 0.06) * 0.5)
     return to_picture(rgb * (_threads(dice, size, 5) * 1.12)[..., None])
 
 
