@@ -17,6 +17,7 @@ from avp_habitat.scenes.builtin.kit import Kit
 from avp_habitat.scenes.builtin.noise import fractal
 from avp_habitat.scenes.builtin.piece import FLAT_M
 from avp_habitat.scenes.builtin.shapes import Material, box, cushion, cylinder, lathe
+from avp_habitat.scenes.builtin.shell import Shell
 from avp_habitat.scenes.builtin.walkway import largest_part
 from avp_habitat.scenes.loader import Scene
 from avp_habitat.simulators.raycast import RaycastSimulator
@@ -347,6 +348,17 @@ def check_outwards(surfaces, inside):
         face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         assert (np.einsum("ij,ij->i", face, corners.mean(axis=1) - inside) >= -1e-12).all()
         assert (np.einsum("tj,tkj->tk", face, surface.normals[surface.triangles]) >= -1e-12).all()
+
+
+def test_the_depth_in_front_of_a_wall_ends_at_the_notch_of_an_l_shaped_room():
+    shell = Shell(((1, 0), (6, 0), (6, 4), (0, 4), (0, 3), (1, 3)), (0, 0, 1, 3), 2.5, ())
+    north, east, south, west, step, inner = shell.walls
+    assert shell.depth_at(north, 2.0) == 4
+    assert shell.depth_at(east, 1.0) == 5
+    assert shell.depth_at(east, 3.5) == 6
+    assert shell.depth_at(south, 5.5) == 1
+    assert shell.depth_at(south, 1.0) == 4
+    assert (shell.depth_at(west, 0.5), shell.depth_at(step, 0.5), shell.depth_at(inner, 1.0)) == (6, 1, 5)
 
 
 def test_noise_repeats_without_a_seam():

@@ -51,7 +51,10 @@ def mix(first: Field, second: Colour | Field, share: Field | float) -> Field:
     """Blend two colour fields; `share` (height, width) in [0, 1] is that of the second."""
     share = np.asarray(share, np.float32)
     share = share[..., None] if share.ndim == 2 else share
-    return first + (np.asarray(second, np.float32) - first) * share
+    blended = np.asarray(second, np.float32) - first
+    blended *= share
+    blended += first
+    return blended
 
 
 def shade(colour: Colour, factor: float) -> Colour:
@@ -68,12 +71,15 @@ def blend(first: Colour, second: Colour, share: float) -> Colour:
 
 def step(value: Field, edge: float | Field, width: float) -> Field:
     """0 below the edge, 1 above it, with a linear transition of the given width."""
-    return np.clip((value - np.float32(edge)) / np.float32(width) + np.float32(0.5), 0, 1)
+    risen = (value - np.float32(edge)) * np.float32(1 / width)
+    risen += np.float32(0.5)
+    return np.clip(risen, 0, 1, out=risen)
 
 
 def wave(value: Field) -> Field:
     """Triangle wave of period 1 in [0, 1]; 0 at whole numbers."""
-    return np.abs((value - np.floor(value)) * 2 - 1) * -1 + 1
+    rest = value - np.floor(value)
+    return 2 * np.minimum(rest, 1 - rest)
 
 
 def cosine_of_multiple(u: Field, v: Field, count: int) -> Field:

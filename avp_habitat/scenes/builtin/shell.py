@@ -1,6 +1,7 @@
 """The empty room as numbers: outline, height, walls, windows and door."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +69,7 @@ class Shell:
     openings: tuple[Opening, ...]
     """Windows and the door."""
 
-    @property
+    @cached_property
     def walls(self) -> tuple[Wall, ...]:
         """One wall from each corner to the next."""
         made = []
@@ -77,7 +78,7 @@ class Shell:
             made.append(Wall((x0, z0), ((x1 - x0) / length, (z1 - z0) / length), length))
         return tuple(made)
 
-    @property
+    @cached_property
     def bounds(self) -> tuple[float, float, float, float]:
         """x0, z0, x1, z1 of the outline."""
         xs, zs = [x for x, _ in self.corners], [z for _, z in self.corners]
@@ -103,13 +104,14 @@ class Shell:
 
     def depth_at(self, wall: Wall, right: float) -> float:
         """Metres from a point of a wall straight to what stands opposite."""
-        reach = 0.1
-        while reach < 12.0:
-            x, z = wall.point(right, reach)
-            if not self.contains(x, z, x, z):
-                return round(reach - 0.05, 2)
-            reach += 0.05
-        return reach
+        point, inward = wall.point(right, 0.0), wall.inward
+        ahead = 0 if inward[0] else 1
+        sign, aside = (1 if inward[ahead] > 0 else -1), 1 - ahead
+        depth = (self.bounds[ahead + 2 if sign > 0 else ahead] - point[ahead]) * sign
+        if self.notch is not None and self.notch[aside] < point[aside] < self.notch[aside + 2]:
+            gap = (self.notch[ahead if sign > 0 else ahead + 2] - point[ahead]) * sign
+            depth = min(depth, gap) if gap > 1e-6 else depth
+        return round(depth, 2)
 
 
 def _outline(dice: Dice) -> tuple[tuple[Point, ...], tuple[float, float, float, float] | None]:
