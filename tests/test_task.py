@@ -8,7 +8,16 @@ from avp_habitat import poses
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import pixel_directions
 from avp_habitat.rewards import PARTS, RewardConstants, StepFacts, reward_parts
-from avp_habitat.settings import LOOK_DOWN, LOOK_UP, MOVE_FORWARD, STOP, TURN_LEFT, TURN_RIGHT, TaskSettings
+from avp_habitat.settings import (
+    ACTION_NAMES,
+    LOOK_DOWN,
+    LOOK_UP,
+    MOVE_FORWARD,
+    STOP,
+    TURN_LEFT,
+    TURN_RIGHT,
+    TaskSettings,
+)
 from avp_habitat.task import ViewpointTask, episode_metrics
 
 SIMULATOR = Corridor()
@@ -254,3 +263,38 @@ def test_wide_coverage_counts_at_least_what_is_visible():
 def test_settings_that_cannot_work_are_refused_by_name(change, words):
     with pytest.raises(UsageError, match=words):
         TaskSettings(**change)
+
+
+def test_the_numbers_of_the_actions_are_those_of_the_design():
+    names = ("move_forward", "turn_left", "turn_right", "look_up", "look_down", "stop")
+    assert names == ACTION_NAMES
+    task = ViewpointTask(SIMULATOR, SETTINGS, agents=6)
+    task.reset(range(6), np.tile([1.0, 0, 1.5], (6, 1)), np.zeros(6))
+    task.step(np.arange(6))
+    # Looking along -Z, forward decreases z; left is a positive yaw, up a positive pitch.
+    np.testing.assert_allclose(task.position[:, 2], [1.25, 1.5, 1.5, 1.5, 1.5, 1.5], atol=1e-6)
+    np.testing.assert_allclose(np.degrees(task.yaw), [0, 30, -30, 0, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(np.degrees(task.pitch), [0, 0, 0, 10, -10, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("actions", "redundant"),
+    [
+        ([TURN_LEFT, TURN_RIGHT], [False, False]),
+        ([TURN_LEFT, TURN_RIGHT, TURN_LEFT], [False, False, True]),
+        ([STOP, LOOK_DOWN], [False, False]),
+        ([LOOK_DOWN, LOOK_UP, LOOK_DOWN, TURN_LEFT], [False, False, True, False]),
+    ],
+)
+@pytest.mark.parametrize("yaw", [0.0, np.pi - 0.01])
+def test_a_view_is_redundant_only_when_place_yaw_and_pitch_all_come_back(actions, redundant, yaw):
+    # Also across the half turn, where yaw jumps from +180 to -180 degrees.
+    narrow = dataclasses.replace(SETTINGS, turn_deg=10.0, constants=RewardConstants(redundancy_angle_deg=5.0))
+    task = ViewpointTask(SIMULATOR, narrow, agents=1)
+    assert [bool(o.facts.redundant[0]) for o in run_one(task, actions, yaw=yaw)] == redundant
+
+
+def test_angles_that_differ_across_the_half_turn_are_close():
+    wide = dataclasses.replace(SETTINGS, turn_deg=10.0, constants=RewardConstants(redundancy_angle_deg=11.0))
+    outcomes = run_one(ViewpointTask(SIMULATOR, wide, agents=1), [STOP, TURN_LEFT], yaw=np.pi - 0.05)
+    assert outcomes[1].facts.redundant.tolist() == [True]
