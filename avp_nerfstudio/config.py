@@ -64,7 +64,7 @@ def trainer_config() -> TrainerConfig:
                 log2_hashmap_size=16,
                 hidden_dim=64,
                 hidden_dim_color=64,
-                num_nerf_samples_per_ray=24,
+                num_nerf_samples_per_ray=16,
                 num_proposal_samples_per_ray=(64,),
                 num_proposal_iterations=1,
                 proposal_initial_sampler="uniform",
