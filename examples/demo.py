@@ -76,8 +76,9 @@ class Demo:
         print(f"   $ {shlex.join(line)}", flush=True)
         for path in fresh:
             _remove(path)
-        # The tracking store is named to the whole chain, whatever the user's environment says about others.
-        env = {**os.environ, "MLFLOW_TRACKING_URI": _TRACKING_URI}
+        # One tracking store for the whole chain, whatever the user's environment says; and none of the hosts' warnings
+        # about each other's versions, which nobody can act on here.
+        env = {**os.environ, "MLFLOW_TRACKING_URI": _TRACKING_URI, "PYTHONWARNINGS": "ignore"}
         program = Path(sys.executable).parent / line[0]
         code = subprocess.run([str(program), *line[1:]], env=env, check=False).returncode
         if code:
@@ -91,7 +92,7 @@ class Demo:
         options = ("--scene", self.settings.scene, "--steps", self.settings.steps, "--seed", self.settings.seed)
         camera = ("--width", 64, "--height", 48)
         target = ("--out", model, "--recording", recording, "--run-name", "demo-training")
-        line = ("python", "examples/train.py", *options, *camera, *target)
+        line = ("python", os.path.relpath(Path(__file__).with_name("train.py")), *options, *camera, *target)
         self.run("train a policy", *line, fresh=[model, recording])
         return model
 

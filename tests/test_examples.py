@@ -1,0 +1,79 @@
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mlflow import MlflowClient
+
+from avp_habitat.rollout import read_rollout
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def run(script, *words, folder):
+    """A script of examples/ as a user runs it from the top of a checkout; results go to `folder`."""
+    env = {**os.environ, "MLFLOW_TRACKING_URI": f"sqlite:///{folder / 'mlflow.db'}", "PYTHONWARNINGS": "ignore"}
+    line = [sys.executable, str(ROOT / "examples" / script), *map(str, words)]
+    return subprocess.run(line, cwd=folder, env=env, capture_output=True, text=True, timeout=550, check=False)
+
+
+def test_the_training_script_trains_tracks_and_saves(tmp_path):
+    camera = ("--width", 16, "--height", 12)
+    words = ("--steps", 2048, "--out", "model.zip", "--recording", "training.rrd", "--run-name", "tiny", *camera)
+    done = run("train.py", *words, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "model.zip: the policy after 2048 steps" in done.stdout
+    assert (tmp_path / "training.rrd").stat().st_size > 10_000
+    client = MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    (found,) = client.search_runs([client.get_experiment_by_name("avp").experiment_id])
+    assert (found.info.run_name, found.info.status) == ("tiny", "FINISHED")
+    assert 0 < found.data.metrics["avp/coverage"] < 1
+
+    collected = subprocess.run(
+        [sys.executable, "-m", "avp_habitat.collect", "--scene", "builtin:0", "--policy", "model.zip", "--budget", "3",
+         "--width", "32", "--height", "24", "--out", "r"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert collected.returncode == 0, collected.stderr
+    assert read_rollout(tmp_path / "r").meta["mlflow_run_id"] == found.info.run_id
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (("--agents", 3), "--agents: expected a divisor of PPO's buffer of 2048 steps, got 3"),
+        (("--reward", "cover"), "unknown reward 'cover'"),
+        (("--steps", 0), "--steps: expected at least 1, got 0"),
+    ],
+)
+def test_wrong_options_of_the_training_end_before_anything_is_loaded(tmp_path, words, error):
+    done = run("train.py", *words, folder=tmp_path)
+    assert done.returncode == 2
+    assert error in done.stderr
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_the_demo_compares_three_methods_and_is_not_repeated(tmp_path):
+    words = ("--out", "d", "--steps", 2048, "--iterations", 20, "--width", 40, "--height", 32)
+    done = run("demo.py", *words, folder=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    table = json.loads((tmp_path / "d" / "table.json").read_text())["methods"]
+    assert set(table) == {"heuristic", "random", "learned"}
+    for method, figures in table.items():
+        assert f"| {method}" in done.stdout
+        assert 3 < figures["eval/psnr"] < 40
+        assert (
+            read_rollout(tmp_path / "d" / "rollouts" / method).meta["metrics"]["coverage"] == figures["eval/coverage"]
+        )
+    assert (tmp_path / "d" / "rollouts.rrd").stat().st_size > 10_000
+
+    again = run("demo.py", *words, folder=tmp_path)
+    assert again.returncode == 0
+    assert again.stdout.count("done before") == 10
+    other = run("demo.py", "--out", "d", "--steps", 4096, folder=tmp_path)
+    assert other.returncode == 2
+    assert "holds a demo with other settings" in other.stderr
