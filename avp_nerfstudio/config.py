@@ -14,7 +14,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from avp_nerfstudio.dataparser import AVPDataParserConfig
 from avp_nerfstudio.model import AVPNerfactoModelConfig
 
-ITERATIONS = 1500
+ITERATIONS = 2500
 
 
 @dataclass
