@@ -3,7 +3,6 @@
 import contextlib
 import socket
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,14 +10,10 @@ import torchmetrics.image.lpip
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
-WEIGHTS = "alexnet-owt-7be5be79.pth"
+from avp_nerfstudio.scores import LPIPS_WEIGHTS, lpips_weights_path
+
 _DOWNLOAD_TIMEOUT_S = 5.0
 _LEAST_SIDE_PX = 31
-
-
-def weights_path() -> Path:
-    """Where torchvision keeps AlexNet's weights: `$TORCH_HOME/hub/checkpoints`, by default in the user's cache."""
-    return Path(torch.hub.get_dir()) / "checkpoints" / WEIGHTS
 
 
 class OptionalLPIPS(nn.Module):
@@ -53,8 +48,8 @@ class OptionalLPIPS(nn.Module):
             self._made = (_lpips(**self._options).to(picture.device),)
         except Exception as error:  # a download fails in many ways: no route, a proxy's page, half a file
             self._leave_out(
-                f"AlexNet's weights are not in {weights_path()} and could not be downloaded ({error}); put {WEIGHTS} "
-                "there, or set TORCH_HOME to a folder that holds it in hub/checkpoints"
+                f"AlexNet's weights are not in {lpips_weights_path()} and could not be downloaded ({error}); put "
+                f"{LPIPS_WEIGHTS} there, or set TORCH_HOME to a folder that holds it in hub/checkpoints"
             )
 
     def _leave_out(self, reason: str) -> None:

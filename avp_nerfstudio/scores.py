@@ -8,6 +8,15 @@ from typing import Any
 
 from avp_habitat.errors import AVPError
 
+LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"
+
+
+def lpips_weights_path() -> Path:
+    """Where torchvision keeps AlexNet's weights: `$TORCH_HOME/hub/checkpoints`, by default in the user's cache."""
+    import torch
+
+    return Path(torch.hub.get_dir()) / "checkpoints" / LPIPS_WEIGHTS
+
 
 class ScoresError(AVPError):
     """A file that is not what `ns-eval` writes."""
@@ -44,8 +53,15 @@ def read_scores(path: str | Path, *, lpips_reason: str | None = None) -> Scores:
         psnr=_number(path, results, "psnr"),
         ssim=_number(path, results, "ssim"),
         lpips=_number(path, results, "lpips") if computed else None,
-        lpips_reason=None if computed else lpips_reason or "ns-eval did not compute it; its output says why",
+        lpips_reason=None if computed else lpips_reason or _likely_reason(),
     )
+
+
+def _likely_reason() -> str:
+    path = lpips_weights_path()
+    if path.exists():
+        return "ns-eval did not compute it; its output says why"
+    return f"AlexNet's weights are not in {path}; nerfstudio downloads them there once, where there is a network"
 
 
 def _results(path: Path) -> dict[str, Any]:

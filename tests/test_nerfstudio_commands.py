@@ -11,8 +11,6 @@ from nerfstudio_room import write_room
 
 pytest.importorskip("nerfstudio")
 
-pytestmark = pytest.mark.slow
-
 PLAIN = [
     "nerfacto",
     "--machine.device-type",
@@ -65,6 +63,7 @@ def test_avp_nerfacto_trains_and_is_scored_without_network(tmp_path):
     assert done.stdout.count("LPIPS is not computed") == 1
 
 
+@pytest.mark.slow
 def test_plain_nerfacto_trains_on_avp_data_and_its_checkpoint_opens_with_the_safe_loader(tmp_path, shared):
     room = write_room(tmp_path / "room", width=80, height=64)
     weights = {"TORCH_HOME": str(shared / "torch_home")}
@@ -74,6 +73,7 @@ def test_plain_nerfacto_trains_on_avp_data_and_its_checkpoint_opens_with_the_saf
     assert {"psnr", "ssim", "lpips"} <= set(results)
 
 
+@pytest.mark.slow
 def test_a_damaged_rollout_ends_ns_train_with_one_line(tmp_path):
     room = write_room(tmp_path / "room", frames=2, heldout=1)
     (room / "images/frame_00001.png").unlink()
