@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from avp_nerfstudio.scores import Scores, ScoresError, read_scores
+from avp_nerfstudio.scores import Scores, ScoresError, lpips_weights_path, read_scores
 
 
 def write(path, results):
@@ -15,10 +15,15 @@ def test_all_three_scores_are_read(tmp_path):
     assert read_scores(path) == Scores(psnr=25.5, ssim=0.9, lpips=0.04, lpips_reason=None)
 
 
-def test_lpips_that_was_not_computed_is_none_with_a_reason(tmp_path):
+def test_lpips_that_was_not_computed_is_none_with_a_reason(tmp_path, monkeypatch):
     path = write(tmp_path / "s.json", {"psnr": 25.5, "ssim": 0.9})
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     assert read_scores(path).lpips is None
-    assert "did not compute it" in str(read_scores(path).lpips_reason)
+    assert f"AlexNet's weights are not in {lpips_weights_path()}" in str(read_scores(path).lpips_reason)
+    assert lpips_weights_path().is_relative_to(tmp_path)
+    lpips_weights_path().parent.mkdir(parents=True)
+    lpips_weights_path().touch()
+    assert "its output says why" in str(read_scores(path).lpips_reason)
     assert read_scores(path, lpips_reason="no weights").lpips_reason == "no weights"
 
 
