@@ -35,7 +35,7 @@ class Settings:
 
     scene: str = "builtin:0"
     """The room."""
-    steps: int = 80_000
+    steps: int = 100_000
     """Environment steps of the training."""
     iterations: int = 1000
     """Of each reconstruction."""
