@@ -1,4 +1,4 @@
-"""Make the README's picture: three generated rooms, and the map of a rollout (`runs/demo/rollouts/learned` by default)."""
+"""Make the README's picture: three generated rooms and the map of a rollout, the demo's by default."""
 
 import sys
 from pathlib import Path
