@@ -49,7 +49,8 @@ def trainer_config() -> TrainerConfig:
         steps_per_eval_batch=0,
         steps_per_eval_image=0,
         steps_per_eval_all_images=0,
-        steps_per_save=0,
+        # A checkpoint is a few megabytes, so an interrupted training keeps nearly all it had.
+        steps_per_save=500,
         mixed_precision=cuda,
         machine=MachineConfig(device_type="cuda" if cuda else "cpu"),
         pipeline=VanillaPipelineConfig(
