@@ -2,13 +2,11 @@
 
 import argparse
 import os
-import platform
 import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +25,7 @@ from avp_habitat.rewards import REWARD_NAMES
 from avp_habitat.rollout_writer import RolloutWriter
 from avp_habitat.settings import ACTION_NAMES, TaskSettings
 from avp_habitat.simulators import SIMULATOR_NAMES, make_simulator
+from avp_habitat.versions import installed_versions
 
 _VERSIONED = ("avp-suite", "numpy", "gymnasium", "open3d", "pillow", "stable-baselines3", "torch")
 _HELDOUT_BATCH = 4
@@ -162,20 +161,10 @@ def _meta(request: Request, env: AVPEnv, policy: Policy, episode: dict[str, floa
         },
         "heldout": {"views": request.heldout, "seed": str(heldout_seed(env.scene_digest))},
         "metrics": episode,
-        "versions": _versions(),
+        "versions": installed_versions(_VERSIONED),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "mlflow_run_id": getattr(policy, "avp_mlflow_run_id", None) or os.environ.get("MLFLOW_RUN_ID"),
     }
-
-
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for name in _VERSIONED:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -8,7 +8,7 @@ camera ray through it. `candidates` answers the first two; the third is answered
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.poses import Intrinsics, project
+from avp_habitat.poses import Intrinsics, project, project_pairs
 
 Float = NDArray[np.floating]
 
@@ -68,10 +68,8 @@ def visible_in_depth(
     camera, point = pairs[:, 0], pairs[:, 1]
     offset = points[point] - camera_to_world[camera, :3, 3]
     distance = np.linalg.norm(offset, axis=1)
-    local = np.einsum("kji,kj->ki", camera_to_world[camera, :3, :3], offset)
-    planar = -local[:, 2]
-    u = intrinsics.fx * local[:, 0] / planar + intrinsics.cx
-    v = -intrinsics.fy * local[:, 1] / planar + intrinsics.cy
+    pixel, planar = project_pairs(points[point], camera_to_world[camera], intrinsics)
+    u, v = pixel.T
     inverse = np.where(depth > 0, 1.0 / np.maximum(depth, 1e-6), 0.0)
     reach = planar * (1.0 - tolerance_m / np.maximum(distance, tolerance_m))
     limit = 1.0 / np.maximum(reach, 1e-6)

@@ -141,7 +141,20 @@ def project(points: Float, pose: Float, intrinsics: Intrinsics) -> tuple[Float, 
         `(n, m)` planar depth in metres, negative behind the camera.
     """
     offset = points[None] - pose[:, None, :3, 3]
-    local = np.einsum("nij,nmi->nmj", pose[:, :3, :3], offset)
+    return _pinhole(np.einsum("nij,nmi->nmj", pose[:, :3, :3], offset), intrinsics)
+
+
+def project_pairs(points: Float, pose: Float, intrinsics: Intrinsics) -> tuple[Float, Float]:
+    """Project the i-th of `(k, 3)` points into the i-th of `(k, 4, 4)` cameras.
+
+    Returns:
+        `(k, 2)` pixel coordinates and `(k,)` planar depth, as `project` gives them.
+    """
+    return _pinhole(np.einsum("kij,ki->kj", pose[:, :3, :3], points - pose[:, :3, 3]), intrinsics)
+
+
+def _pinhole(local: Float, intrinsics: Intrinsics) -> tuple[Float, Float]:
+    """Pixels `(..., 2)` and planar depth `(...)` of points `(..., 3)` in habitat camera axes."""
     depth = -local[..., 2]
     safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
     u = intrinsics.fx * local[..., 0] / safe + intrinsics.cx

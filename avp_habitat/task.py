@@ -256,7 +256,7 @@ class ViewpointTask:
             pitch=self.pitch[rows],
             min_depth=least,
             mean_depth=mean,
-            coverage=np.count_nonzero(self.first_seen[rows], axis=1) / self._cells,
+            coverage=self.coverage[rows],
             collided=self._collided[rows],
             spread=self._spread(rows) / radius,
         )

@@ -2,14 +2,14 @@
 
 import dataclasses
 import inspect
-import platform
 import subprocess
 from collections.abc import Mapping
-from importlib import metadata
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
+
+from avp_habitat.versions import installed_versions
 
 PACKAGES = ("avp-suite", "stable-baselines3", "torch", "gymnasium", "numpy", "open3d", "mlflow")
 _NOT_HYPERPARAMETERS = {"self", "env", "policy", "verbose", "tensorboard_log", "_init_setup_model"}
@@ -55,13 +55,7 @@ def scene_tags(env: VecEnv) -> dict[str, str]:
 
 def version_tags() -> dict[str, str]:
     """`version.PACKAGE` of Python and the packages that shape a training; packages that are absent are left out."""
-    tags = {"version.python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            tags[f"version.{package}"] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
-    return tags
+    return {f"version.{name}": version for name, version in installed_versions(PACKAGES).items()}
 
 
 def git_commit() -> str | None:

@@ -162,6 +162,8 @@ def read_row(method: str, rollout: Path, scores: Path) -> tuple[Row, str | None]
 
 def write_table(folder: Path, rows: Sequence[Row], settings: Settings) -> str:
     """The comparison as Markdown, CSV and JSON in the folder; gives the Markdown."""
+    from avp_sb3.run_facts import git_commit
+
     lines = [row.cells() for row in rows]
     titles = list(lines[0])
     width = {title: max(len(title), *(len(line[title]) for line in lines)) for title in titles}
@@ -175,7 +177,7 @@ def write_table(folder: Path, rows: Sequence[Row], settings: Settings) -> str:
         writer.writerows(lines)
     origin = {
         "settings": asdict(settings),
-        "commit": _commit(),
+        "commit": git_commit(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
     }
     figures = {row.method: row.metrics for row in rows}
@@ -217,11 +219,6 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-def _commit() -> str | None:
-    done = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
-    return done.stdout.strip() or None
 
 
 def _open(argv: Sequence[str]) -> Demo:

@@ -1,7 +1,7 @@
 """Habitat-Sim as a simulator of the suite: its renderer and its NavMesh, on the CPU or a GPU.
 
 What ends the process inside Habitat-Sim (a second simulator, a missing CUDA device, a missing NavMesh) is caught here
-before it happens. Facts about its behaviour are from versions 0.2.4 to 0.3.4.
+before it happens. It follows what is known of versions 0.2.4 to 0.3.4 and has not been run with any of them yet.
 """
 
 import json
