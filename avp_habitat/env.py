@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from avp_habitat.agent_view import AgentView
 from avp_habitat.errors import UsageError, unknown_name
 from avp_habitat.observation import HIGH, LOW
 from avp_habitat.poses import Intrinsics
@@ -87,6 +88,11 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         """The agent's feet, `(3,)` metres, and its yaw and pitch in radians."""
         task = self._task
         return task.position[0].copy(), float(task.yaw[0]), float(task.pitch[0])
+
+    @property
+    def agent_view(self) -> AgentView:
+        """What planners may know about the agent."""
+        return self._task.agent_view(0)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat import metrics, poses
+from avp_habitat.agent_view import AgentView
 from avp_habitat.coverage import candidates
 from avp_habitat.coverage_over import cells_passed_over
 from avp_habitat.observation import depth_statistics, observation
@@ -156,6 +157,20 @@ class ViewpointTask:
             collided=log["collided"].astype(np.bool_),
             redundant=log["redundant"].astype(np.bool_),
             first_seen=self.first_seen[row].copy(),
+        )
+
+    def agent_view(self, row: int) -> AgentView:
+        """What planners may know about one agent."""
+        return AgentView(
+            settings=self.settings,
+            simulator=self.simulator,
+            position=self.position[row].copy(),
+            yaw=float(self.yaw[row]),
+            pitch=float(self.pitch[row]),
+            steps=int(self.steps[row]),
+            observed=self.first_seen[row] > 0,
+            centre_depth=float(self.centre_depth[row]),
+            collided=bool(self._collided[row]),
         )
 
     def _sensor_poses(self, position: Float, yaw: Float, pitch: Float) -> NDArray[np.float64]:

@@ -119,6 +119,8 @@ class AVPVecEnv(VecEnv):
             return [float(self._task.centre_depth[row]) for row in rows]
         if attr_name == "camera_to_world":
             return [self._task.camera_to_world[row] for row in rows]
+        if attr_name == "agent_view":
+            return [self._task.agent_view(row) for row in rows]
         return [getattr(self, attr_name) for _ in rows]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:

@@ -1,0 +1,47 @@
+"""What a planner may know about one agent: its state, and the floor cells that it has observed."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.navigation.area import NavigableArea
+from avp_habitat.settings import TaskSettings
+from avp_habitat.simulators.base import Simulator
+
+
+@dataclass(frozen=True)
+class AgentView:
+    """One agent of the task at this moment; arrays are copies."""
+
+    settings: TaskSettings
+    """Of the task: amounts of the actions, camera, range, budget."""
+    simulator: Simulator
+    """The whole scene. Only a planner with full knowledge (the oracle) may ask it, or read cells not yet observed."""
+    position: NDArray[np.float64]
+    """`(3,)` the feet, metres."""
+    yaw: float
+    """Radians, left positive."""
+    pitch: float
+    """Radians, up positive."""
+    steps: int
+    """t: views taken so far in the episode."""
+    observed: NDArray[np.bool_]
+    """`(m,)` which of `area.centres` were observed."""
+    centre_depth: float
+    """Planar depth in metres in the middle of the newest view, the whole range where nothing was hit."""
+    collided: bool
+    """Whether the newest step was a blocked forward move."""
+
+    @property
+    def area(self) -> NavigableArea:
+        """The scene's navigable area; unobserved parts of its mask are not known to the agent."""
+        return self.simulator.area
+
+
+def agent_views(env: Any) -> list[AgentView]:
+    """The agents of an `AVPEnv` (also a wrapped one) or of a vector environment of them, in order."""
+    if hasattr(env, "get_attr"):
+        return env.get_attr("agent_view")
+    return [env.get_wrapper_attr("agent_view")]
