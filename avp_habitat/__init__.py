@@ -9,4 +9,4 @@ ENV_ID = "AVP-v0"
 
 if ENV_ID not in gymnasium.registry:
     # The task counts its own budget, so gymnasium's TimeLimit is not used.
-    gymnasium.register(ENV_ID, entry_point="avp_habitat.env:AVPEnv")
+    gymnasium.register(ENV_ID, entry_point="avp_habitat.recording:make_env")

@@ -1,0 +1,105 @@
+"""The hook by which rl_zoo3 steps its environments as one batch: `vec_env_wrapper: avp_sb3.zoo.Batched`."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import gymnasium
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
+
+from avp_habitat.env import AVPEnv
+from avp_habitat.errors import UsageError
+from avp_habitat.settings import TaskSettings
+from avp_habitat.simulators import Simulator
+from avp_sb3.vec_env import AVPVecEnv
+
+_REPLACED = (Monitor, OrderEnforcing, PassiveEnvChecker)
+"""Wrappers whose work the batch does itself, or does not need."""
+_WITH_LOOKUP = "raycast"
+
+
+def Batched(venv: VecEnv, *, lookup: bool = True) -> VecEnv:
+    """The same agents as one `AVPVecEnv` within a `VecMonitor`: same scenes, settings and starts, stepped as arrays.
+
+    Left as they are: environments in processes of their own (`--vec-env subproc`), and those that are rendered,
+    recorded or wrapped otherwise, because a batch would leave that out.
+
+    Args:
+        venv: what rl_zoo3 made.
+        lookup: look visibility up in tables per scene where the simulator casts rays; False casts them.
+
+    Raises:
+        UsageError: an environment is no `AVPEnv`, or their settings differ.
+    """
+    if not isinstance(venv, DummyVecEnv):
+        return venv
+    envs = [_avp_env(env) for env in venv.envs]
+    if (reason := _reason_to_leave(venv.envs)) is not None:
+        print(f"Batched: the environments are stepped one by one: {reason}")
+        return venv
+    simulators = _shortest_cycle([env.simulator for env in envs])
+    batch = AVPVecEnv(
+        simulators[0].scene,
+        agents=len(envs),
+        simulator=simulators[0] if len(simulators) == 1 else simulators,
+        settings=_settings(envs, lookup=lookup),
+        seed=venv._seeds[0],
+    )
+    folder = _take_over_monitors(venv)
+    venv.close()
+    return VecMonitor(batch, filename=folder)
+
+
+def _avp_env(env: gymnasium.Env) -> AVPEnv:
+    inner = env.unwrapped
+    if not isinstance(inner, AVPEnv):
+        name = type(inner).__name__
+        raise UsageError(f"vec_env_wrapper avp_sb3.zoo.Batched: expected environments of AVP-v0, got {name}")
+    return inner
+
+
+def _reason_to_leave(envs: list[gymnasium.Env]) -> str | None:
+    """What the batch would leave out; None when it would leave out nothing."""
+    for env in envs:
+        if env.render_mode is not None:
+            return f"render_mode {env.render_mode!r}"
+        while isinstance(env, gymnasium.Wrapper):
+            if not isinstance(env, _REPLACED):
+                return f"wrapped in {type(env).__name__}"
+            env = env.env
+    return None
+
+
+def _settings(envs: list[AVPEnv], *, lookup: bool) -> TaskSettings:
+    settings = envs[0].settings
+    for index, env in enumerate(envs):
+        for field in fields(settings):
+            first, other = getattr(settings, field.name), getattr(env.settings, field.name)
+            if first != other:
+                raise UsageError(
+                    "vec_env_wrapper avp_sb3.zoo.Batched: expected the same settings in every environment, found "
+                    f"{field.name} {first!r} in number 0 and {other!r} in number {index}"
+                )
+    if "lookup" not in TaskSettings.__dataclass_fields__:
+        return settings
+    rays = all(env.simulator.name == _WITH_LOOKUP for env in envs)
+    return replace(settings, lookup=lookup and rays)
+
+
+def _shortest_cycle(simulators: list[Simulator]) -> list[Simulator]:
+    """The fewest scenes such that agent i walks in scene i modulo their number."""
+    for length in range(1, len(simulators)):
+        if all(simulator is simulators[i % length] for i, simulator in enumerate(simulators)):
+            return simulators[:length]
+    return simulators
+
+
+def _take_over_monitors(venv: DummyVecEnv) -> str | None:
+    """The folder of the environments' monitor files, which hold a header only and are removed; None without them."""
+    writers = [writer for writer in venv.get_attr("results_writer") if writer is not None]
+    files = [Path(writer.file_handler.name) for writer in writers]
+    for writer, file in zip(writers, files, strict=True):
+        writer.close()
+        file.unlink()
+    return str(files[0].parent) if files else None
