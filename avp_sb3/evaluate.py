@@ -1,0 +1,154 @@
+"""`python -m avp_sb3.evaluate`: compare policies on one scene, all from the same starts."""
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from avp_habitat import command
+from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.policies import POLICY_NAMES
+from avp_habitat.rewards import REWARD_NAMES
+from avp_habitat.settings import TaskSettings
+from avp_habitat.simulators import SIMULATOR_NAMES
+from avp_sb3.evaluation import OBSERVATIONS, Contestant, EpisodeResult, PolicyResult, run_episodes
+from avp_sb3.evaluation_report import check_new, table, write_report
+
+EXPERIMENT = "avp-evaluation"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m avp_sb3.evaluate",
+        description="Run policies on one scene from the same starts; compare coverage per view, views, path, stops.",
+    )
+    add = parser.add_argument
+    add("--scene", required=True, help="a mesh (.glb .gltf .ply .obj), or builtin:SEED for a generated room")
+    add(
+        "--policy",
+        required=True,
+        action="append",
+        metavar="POLICY",
+        help=f"{', '.join(POLICY_NAMES)}, or a PPO model (.zip); give it again for each policy to compare",
+    )
+    add("--episodes", default=20, type=int, help="per policy (default: %(default)s)")
+    add("--seed", default=1000, type=int, help="of the first start; episode i uses SEED + i (default: %(default)s)")
+    add("--reward", default="proposed", metavar="REWARD", help=f"{', '.join(REWARD_NAMES)} (default: %(default)s)")
+    add("--observation", default=None, metavar="KIND", help=f"{', '.join(OBSERVATIONS)} (default: the model's own)")
+    add("--simulator", default="raycast", metavar="NAME", help=f"{', '.join(SIMULATOR_NAMES)} (default: %(default)s)")
+    add("--budget", default=80, type=int, help="steps, which are views (default: %(default)s)")
+    add("--width", default=160, type=int, help="of the policy's depth image in pixels (default: %(default)s)")
+    add("--height", default=120, type=int, help="of the policy's depth image in pixels (default: %(default)s)")
+    add("--stochastic", action="store_true", help="sample a model's actions instead of taking the likeliest")
+    add("--out", default=None, type=Path, help="folder of the report (default: runs/evaluation-DATE-TIME)")
+    add("--experiment", default=EXPERIMENT, help="of MLflow (default: %(default)s)")
+    add("--no-mlflow", action="store_true", help="log nothing to MLflow")
+    return parser
+
+
+def _options(argv: Sequence[str]) -> argparse.Namespace:
+    options = _parser().parse_args(argv)
+    if options.episodes < 1:
+        raise UsageError(f"--episodes: expected at least 1, got {options.episodes}")
+    if options.seed < 0:
+        raise UsageError(f"--seed: expected a whole number from 0, got {options.seed}")
+    if options.observation not in (None, *OBSERVATIONS):
+        raise unknown_name("observation", options.observation, OBSERVATIONS)
+    if options.out is None:
+        options.out = Path("runs") / f"evaluation-{datetime.now():%Y%m%d-%H%M%S}"
+    check_new(options.out)
+    options.policy = list(dict.fromkeys(options.policy))
+    return options
+
+
+def main(argv: Sequence[str]) -> None:
+    """Evaluate, print the table, write the report, log it."""
+    options = _options(argv)
+    settings = TaskSettings(reward=options.reward, budget=options.budget, width=options.width, height=options.height)
+    # All of them before the first episode, so that the last one's fault does not cost the others' time.
+    contestants = [
+        Contestant(
+            policy,
+            options.scene,
+            settings,
+            simulator=options.simulator,
+            observation=options.observation,
+            stochastic=options.stochastic,
+        )
+        for policy in options.policy
+    ]
+    done: dict[str, list[EpisodeResult]] = {}
+    try:
+        _run(contestants, options, done)
+    except KeyboardInterrupt:
+        _finish(contestants, done, options, argv, complete=False)
+        raise
+    _finish(contestants, done, options, argv, complete=True)
+
+
+def _run(contestants: Sequence[Contestant], options: argparse.Namespace, done: dict[str, list[EpisodeResult]]) -> None:
+    with tqdm(total=len(contestants) * options.episodes, unit="episode", disable=None) as progress:
+        for contestant in contestants:
+            progress.set_description(contestant.name)
+            done[contestant.name] = []
+            for episode in run_episodes(contestant, options.episodes, options.seed, progress.update):
+                done[contestant.name].append(episode)
+
+
+def _finish(
+    contestants: Sequence[Contestant],
+    done: dict[str, list[EpisodeResult]],
+    options: argparse.Namespace,
+    argv: Sequence[str],
+    *,
+    complete: bool,
+) -> None:
+    results = [contestant.result(done[contestant.name]) for contestant in contestants if done.get(contestant.name)]
+    if not results:
+        return
+    about = _about(contestants[0], options, argv, complete=complete)
+    print(table(results))
+    write_report(options.out, results, about)
+    if not complete:
+        print(f"interrupted after {sum(len(result.seeds) for result in results)} episodes, which are kept")
+    print(f"report:  {options.out}")
+    if not options.no_mlflow:
+        _track(results, about, options, complete=complete)
+
+
+def _track(
+    results: Sequence[PolicyResult], about: dict[str, Any], options: argparse.Namespace, *, complete: bool
+) -> None:
+    # Late: mlflow takes seconds to import.
+    from avp_sb3.evaluation_tracking import track_evaluation
+
+    run, store = track_evaluation(results, about, options.out, experiment=options.experiment, complete=complete)
+    print(f"MLflow:  run {run} in experiment {options.experiment!r} at {store}")
+
+
+def _about(
+    contestant: Contestant, options: argparse.Namespace, argv: Sequence[str], *, complete: bool
+) -> dict[str, Any]:
+    env = contestant.env
+    settings = asdict(env.settings)
+    settings.pop("observation", None)  # Each policy has its own.
+    return {
+        "command": shlex.join(["python", "-m", "avp_sb3.evaluate", *argv]),
+        "complete": complete,
+        "scene": {"name": env.scene_name, "sha256": env.scene_digest, "navigable_cells": len(env.area.centres)},
+        "simulator": {"name": env.simulator.name, "version": env.simulator.version},
+        "seed": options.seed,
+        "episodes": options.episodes,
+        "stochastic": options.stochastic,
+        "settings": settings,
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(command.run(main))
