@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.agent_view import AgentView
 from avp_habitat.errors import UsageError, unknown_name
-from avp_habitat.observation import HIGH, LOW
+from avp_habitat.observation import observation_bounds
 from avp_habitat.poses import Intrinsics
 from avp_habitat.settings import ACTION_NAMES, TaskSettings
 from avp_habitat.simulators import Frames, Simulator, make_simulator
@@ -22,7 +22,7 @@ _PICTURE = (480, 360)
 class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
     """An agent that walks through a scene and decides which views to take.
 
-    Observations are the twelve numbers of `observation.NAMES`, actions the six of `settings.ACTION_NAMES`. `info` of
+    Observations are the twelve numbers of `observation.NAMES` (and a map with `observation="map"`), actions the six of `settings.ACTION_NAMES`. `info` of
     every step holds `coverage`, `new_cells`, `views`, `collided`, `redundant` and `reward_parts`; the last step of an
     episode adds `avp_episode` (figures, see `task.episode_metrics`), `avp_trajectory` and `is_success`.
     """
@@ -57,7 +57,7 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         self.settings = _with_overrides(settings or TaskSettings(), overrides)
         self.simulator = make_simulator(simulator, scene) if isinstance(simulator, str) else simulator
         self.render_mode = render_mode
-        self.observation_space = gymnasium.spaces.Box(LOW, HIGH, dtype=np.float32)
+        self.observation_space = gymnasium.spaces.Box(*observation_bounds(self.settings.observation), dtype=np.float32)
         self.action_space = gymnasium.spaces.Discrete(len(ACTION_NAMES))
         self.area = self.simulator.area
         self._task = ViewpointTask(self.simulator, self.settings, agents=1)
@@ -76,7 +76,7 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
     @property
     def centre_depth(self) -> float:
         """Planar depth in metres in the middle of the newest view."""
-        return float(self._task.centre_depth[0])
+        return self._task.centre_depth(0)
 
     @property
     def camera_to_world(self) -> NDArray[np.float64]:
@@ -130,7 +130,7 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         if not self.action_space.contains(np.int64(action)):
             raise UsageError(f"action: expected 0 to {len(ACTION_NAMES) - 1}, got {action!r}")
         outcome = self._task.step(np.array([action]))
-        info = step_info(self._task, outcome, 0)
+        info = step_info(self._task, outcome)[0]
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         self._running = not (terminated or truncated)
         return outcome.observation[0], float(outcome.reward[0]), terminated, truncated, info
@@ -164,24 +164,33 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         return point
 
 
-def step_info(task: ViewpointTask, outcome: StepOutcome, row: int) -> dict[str, Any]:
-    """`info` of one agent's step, with the episode's figures and trajectory when it ends there."""
+def step_info(task: ViewpointTask, outcome: StepOutcome) -> list[dict[str, Any]]:
+    """`info` of all agents' steps; those whose episode ends there get its figures and trajectory."""
     facts = outcome.facts
-    info: dict[str, Any] = {
-        "coverage": float(facts.coverage[row]),
-        "new_cells": int(facts.new_cells[row]),
-        "views": int(task.steps[row]),
-        "collided": bool(facts.collided[row]),
-        "redundant": bool(facts.redundant[row]),
-        "reward_parts": {name: float(values[row]) for name, values in outcome.parts.items()},
-    }
-    if outcome.terminated[row] or outcome.truncated[row]:
+    names = tuple(outcome.parts)
+    # Whole columns become Python numbers at once: this is done for every step of every agent.
+    columns = (facts.coverage, facts.new_cells, task.steps, facts.collided, facts.redundant)
+    parts = np.stack(list(outcome.parts.values()), axis=1).tolist()
+    infos: list[dict[str, Any]] = [
+        {
+            "coverage": coverage,
+            "new_cells": new_cells,
+            "views": views,
+            "collided": collided,
+            "redundant": redundant,
+            "reward_parts": dict(zip(names, values, strict=True)),
+        }
+        for coverage, new_cells, views, collided, redundant, values in zip(
+            *(column.tolist() for column in columns), parts, strict=True
+        )
+    ]
+    for row in np.flatnonzero(outcome.terminated | outcome.truncated):
         stopped = bool(outcome.terminated[row])
-        trajectory = task.trajectory(row)
-        info["avp_episode"] = episode_metrics(trajectory, stopped=stopped)
-        info["avp_trajectory"] = trajectory
-        info["is_success"] = stopped
-    return info
+        trajectory = task.trajectory(int(row))
+        infos[row]["avp_episode"] = episode_metrics(trajectory, stopped=stopped)
+        infos[row]["avp_trajectory"] = trajectory
+        infos[row]["is_success"] = stopped
+    return infos
 
 
 def _with_overrides(settings: TaskSettings, overrides: dict[str, Any]) -> TaskSettings:

@@ -10,6 +10,7 @@ from avp_habitat.rewards import RewardConstants, check_reward
 ACTION_NAMES = ("move_forward", "turn_left", "turn_right", "look_up", "look_down", "stop")
 MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, LOOK_UP, LOOK_DOWN, STOP = range(len(ACTION_NAMES))
 COVERAGE_MODES = ("visible", "over")
+OBSERVATION_NAMES = ("numbers", "map")
 
 
 @dataclass(frozen=True)
@@ -46,12 +47,18 @@ class TaskSettings:
     """A hit this close before a floor point still observes it, metres along the ray."""
     coverage_mode: Literal["visible", "over"] = "visible"
     """visible: a cell's floor point is seen. over: a camera ray passes over the cell."""
+    observation: Literal["numbers", "map"] = "numbers"
+    """numbers: the twelve of the design. map: these, and a map of what was seen around the agent."""
+    lookup: bool = False
+    """Whether views are looked up in tables of the scene instead of casting all their rays: faster, for training."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot work, by the option's name."""
         check_reward(self.reward)
         if self.coverage_mode not in COVERAGE_MODES:
             raise unknown_name("coverage_mode", self.coverage_mode, COVERAGE_MODES)
+        if self.observation not in OBSERVATION_NAMES:
+            raise unknown_name("observation", self.observation, OBSERVATION_NAMES)
         for name in (
             "budget",
             "width",

@@ -5,22 +5,24 @@ together. Every step of an agent captures one view, also a step that does not mo
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat import metrics, poses
 from avp_habitat.agent_view import AgentView
-from avp_habitat.coverage import candidates
-from avp_habitat.coverage_over import cells_passed_over
-from avp_habitat.observation import depth_statistics, observation
+from avp_habitat.map_observation import SIZE as MAP_SIZE
+from avp_habitat.map_observation import MapObserver
+from avp_habitat.observation import observation
 from avp_habitat.rewards import PARTS, StepFacts, has_stop, reward_parts, stops_episode
+from avp_habitat.senses import Perception, Senses, Views, make_senses
 from avp_habitat.settings import LOOK_DOWN, LOOK_UP, MOVE_FORWARD, STOP, TURN_LEFT, TURN_RIGHT, TaskSettings
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.trajectory import Trajectory
 
 Float = NDArray[np.floating]
+Rows = NDArray[np.int64]
 _PART_COLUMNS = tuple(f"part {name}" for name in PARTS)
 
 
@@ -29,7 +31,7 @@ class StepOutcome:
     """What one step of n agents gave; every array's first axis is n."""
 
     observation: NDArray[np.float32]
-    """`(n, 12)`."""
+    """`(n, 12)`, or longer with a map."""
     reward: NDArray[np.float64]
     """`(n,)` sum of the parts."""
     parts: dict[str, NDArray[np.float64]]
@@ -42,45 +44,82 @@ class StepOutcome:
     """What the reward was computed from."""
 
 
-class ViewpointTask:
-    """The state of n agents in one scene."""
+@dataclass(frozen=True)
+class _Room:
+    """One scene and the agents in it."""
 
-    def __init__(self, simulator: Simulator, settings: TaskSettings, agents: int) -> None:
+    simulator: Simulator
+    senses: Senses
+    maps: MapObserver
+    cells: int
+    rows: Rows
+
+
+class ViewpointTask:
+    """The state of n agents, each in its scene."""
+
+    def __init__(self, simulators: Simulator | Sequence[Simulator], settings: TaskSettings, agents: int) -> None:
         """Make room for n agents; `reset` places them.
 
         Args:
-            simulator: renders and knows the navigable area; never named further.
+            simulators: one for each scene, never named further; agent i is in scene i modulo their number.
             settings: of the task.
             agents: n, at least 1.
+
+        Raises:
+            UsageError: the settings ask for what a simulator cannot do.
         """
-        self.simulator = simulator
+        scenes = list(simulators) if isinstance(simulators, Sequence) else [simulators]
         self.settings = settings
         self.agents = agents
-        area, budget = simulator.area, settings.budget
-        self._cells = len(area.centres)
-        self._intrinsics = settings.intrinsics
+        self._everyone = np.arange(agents)
+        self._room_of = self._everyone % len(scenes)
+        self._rooms = [
+            _Room(
+                scene,
+                make_senses(scene, settings),
+                MapObserver(scene.area),
+                len(scene.area.centres),
+                np.flatnonzero(self._room_of == index),
+            )
+            for index, scene in enumerate(scenes[:agents])
+        ]
+        self._cells = np.array([self._rooms[index].cells for index in self._room_of])
+        self._diameter = np.array([self._rooms[index].simulator.area.diameter_m for index in self._room_of])
+        budget = settings.budget
         self.steps = np.zeros(agents, dtype=np.int64)
         self.position = np.zeros((agents, 3))
         self.yaw = np.zeros(agents)
         self.pitch = np.zeros(agents)
-        self.first_seen = np.zeros((agents, self._cells), dtype=np.int16)
-        self.centre_depth = np.zeros(agents)
-        """`(n,)` planar depth in metres in the middle of the newest view, the whole range where nothing was hit."""
+        self._first_seen = np.zeros((agents, self._cells.max()), dtype=np.int16)
+        self._observed = np.zeros(agents, dtype=np.int64)
         self._collided = np.zeros(agents, dtype=np.bool_)
         # Row 0 is the start, row t the state after step t.
         self._path = np.zeros((agents, budget + 1, 3))
         self._angles = np.zeros((agents, budget + 1, 2))
+        self._cell = np.zeros((agents, budget + 1, 2), dtype=np.int64)
         self._log = {
             name: np.zeros((agents, budget))
             for name in ("action", "reward", "coverage", "collided", "redundant", *_PART_COLUMNS)
         }
-        self._cell_index = np.full(area.mask.shape, -1, dtype=np.int64)
-        self._cell_index[area.mask] = np.arange(self._cells)
+
+    def simulator(self, row: int) -> Simulator:
+        """The simulator of one agent's scene."""
+        return self._rooms[self._room_of[row]].simulator
+
+    def first_seen(self, row: int) -> NDArray[np.int16]:
+        """`(m,)` for each cell of one agent's scene, the step whose view first observed it; 0 for never."""
+        return self._first_seen[row, : self._cells[row]]
+
+    def centre_depth(self, row: int) -> float:
+        """Planar depth in metres in the middle of an agent's newest view, the whole range where nothing is hit."""
+        rows = np.array([row])
+        return float(self._rooms[self._room_of[row]].senses.centre_depth(self._views(rows))[0])
 
     @property
     def coverage(self) -> NDArray[np.float64]:
         """`(n,)` C of the running episodes (Eq. 17)."""
-        return np.count_nonzero(self.first_seen, axis=1) / self._cells
+        return self._observed / self._cells
 
     @property
     def camera_to_world(self) -> NDArray[np.float64]:
@@ -96,16 +135,17 @@ class ViewpointTask:
             yaw: `(len(rows),)` radians.
 
         Returns:
-            `(len(rows), 12)` first observations; their views are not captured and observe nothing.
+            `(len(rows), 12)` first observations, longer with a map; their views are not captured and observe nothing.
         """
         rows = np.asarray(rows, dtype=np.int64)
         self.position[rows], self.yaw[rows], self.pitch[rows] = position, poses.wrap_angle(yaw), 0.0
-        self.steps[rows], self.first_seen[rows], self._collided[rows] = 0, 0, False
-        self._path[rows, 0] = position
-        self._angles[rows, 0] = np.stack([self.yaw[rows], self.pitch[rows]], axis=1)
-        depth = self._look(self.camera_to_world[rows])
-        self.centre_depth[rows] = self._centre(depth)
-        return self._observe(rows, depth)
+        self.steps[rows], self._first_seen[rows], self._collided[rows], self._observed[rows] = 0, 0, False, 0
+        self._remember(rows)
+        least, mean = np.empty((2, len(rows)))
+        for room, chosen in self._by_room(rows):
+            seen = room.senses.look(self._views(rows[chosen]))
+            least[chosen], mean[chosen] = seen.least, seen.mean
+        return self._observe(rows, Perception(least, mean, np.zeros(len(rows), dtype=np.int64)), np.zeros(len(rows)))
 
     def step(self, actions: NDArray[np.integer]) -> StepOutcome:
         """Advance every agent by one action and one captured view.
@@ -114,23 +154,18 @@ class ViewpointTask:
             actions: `(n,)` numbers of `settings.ACTION_NAMES`.
         """
         actions = np.asarray(actions)
-        everyone = np.arange(self.agents)
         self._collided = self._move(actions)
         self.steps += 1
-        self._path[everyone, self.steps] = self.position
-        self._angles[everyone, self.steps] = np.stack([self.yaw, self.pitch], axis=1)
-        sensor = self.camera_to_world
-        depth = self._look(sensor)
-        self.centre_depth = self._centre(depth)
-        new = self._new_cells(sensor, depth)
-        self.first_seen[new] = np.broadcast_to(self.steps[:, None], new.shape)[new]
-        facts = self._facts(actions, new)
+        self._remember(self._everyone)
+        seen = self._capture()
+        self._observed += seen.new_cells
+        facts = self._facts(actions, seen.new_cells)
         parts = reward_parts(self.settings.reward, facts, self.settings.constants)
         reward = np.sum([parts[name] for name in PARTS], axis=0)
         terminated = stops_episode(facts, self.settings.constants)
         self._record(actions, reward, parts, facts)
         return StepOutcome(
-            observation=self._observe(everyone, depth),
+            observation=self._observe(self._everyone, seen, facts.spread_m),
             reward=reward,
             parts=parts,
             terminated=terminated,
@@ -156,26 +191,45 @@ class ViewpointTask:
             coverage=log["coverage"],
             collided=log["collided"].astype(np.bool_),
             redundant=log["redundant"].astype(np.bool_),
-            first_seen=self.first_seen[row].copy(),
+            first_seen=self.first_seen(row).copy(),
         )
 
     def agent_view(self, row: int) -> AgentView:
         """What planners may know about one agent."""
         return AgentView(
             settings=self.settings,
-            simulator=self.simulator,
+            simulator=self.simulator(row),
             position=self.position[row].copy(),
             yaw=float(self.yaw[row]),
             pitch=float(self.pitch[row]),
             steps=int(self.steps[row]),
-            observed=self.first_seen[row] > 0,
-            centre_depth=float(self.centre_depth[row]),
+            observed=self.first_seen(row) > 0,
+            centre_depth=self.centre_depth(row),
             collided=bool(self._collided[row]),
         )
+
+    def _by_room(self, rows: Rows) -> list[tuple[_Room, NDArray[np.integer]]]:
+        """The rooms of some agents, and which of those agents are in each."""
+        if len(self._rooms) == 1:
+            return [(self._rooms[0], np.arange(len(rows)))]
+        rooms = self._room_of[rows]
+        return [(self._rooms[index], np.flatnonzero(rooms == index)) for index in np.unique(rooms)]
+
+    def _views(self, rows: Rows) -> Views:
+        position, yaw, pitch = self.position[rows], self.yaw[rows], self.pitch[rows]
+        return Views(position, yaw, pitch, self._sensor_poses(position, yaw, pitch))
 
     def _sensor_poses(self, position: Float, yaw: Float, pitch: Float) -> NDArray[np.float64]:
         raised = position + np.array([0.0, self.settings.sensor_height_m, 0.0])
         return poses.camera_to_world(raised, yaw=yaw, pitch=pitch)
+
+    def _remember(self, rows: Rows) -> None:
+        """Enter where some agents are now into their paths."""
+        steps = self.steps[rows]
+        self._path[rows, steps] = self.position[rows]
+        self._angles[rows, steps, 0], self._angles[rows, steps, 1] = self.yaw[rows], self.pitch[rows]
+        for room, chosen in self._by_room(rows):
+            self._cell[rows[chosen], steps[chosen]] = room.simulator.area.cell_of(self.position[rows[chosen]])
 
     def _move(self, actions: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Apply the actions; `(n,)` whether a forward move was blocked."""
@@ -185,96 +239,71 @@ class ViewpointTask:
         self.yaw = poses.wrap_angle(self.yaw + turn * ((actions == TURN_LEFT) * 1.0 - (actions == TURN_RIGHT)))
         pitch = self.pitch + tilt * ((actions == LOOK_UP) * 1.0 - (actions == LOOK_DOWN))
         self.pitch = np.clip(pitch, -limit, limit)
-        walking = np.flatnonzero(actions == MOVE_FORWARD)
         collided = np.zeros(self.agents, dtype=np.bool_)
-        if len(walking):
-            before = self.position[walking]
-            after = self.simulator.area.slide(before, poses.heading(self.yaw[walking]) * settings.forward_m)
-            collided[walking] = np.linalg.norm((after - before)[:, [0, 2]], axis=1) < settings.collision_m
-            self.position[walking] = after
+        walking = np.flatnonzero(actions == MOVE_FORWARD)
+        for room, chosen in self._by_room(walking):
+            rows = walking[chosen]
+            before = self.position[rows]
+            after = room.simulator.area.slide(before, poses.heading(self.yaw[rows]) * settings.forward_m)
+            collided[rows] = np.linalg.norm((after - before)[:, [0, 2]], axis=1) < settings.collision_m
+            self.position[rows] = after
         return collided
 
-    def _look(self, sensor: Float) -> Float:
-        return self.simulator.render(sensor, self._intrinsics, rgb=False).depth
+    def _capture(self) -> Perception:
+        """What the newest views of all agents show; their new cells are marked."""
+        if len(self._rooms) == 1:
+            room = self._rooms[0]
+            return room.senses.capture(self._views(room.rows), self._first_seen, room.rows, self.steps)
+        whole = Perception(np.empty(self.agents), np.empty(self.agents), np.empty(self.agents, dtype=np.int64))
+        for room in self._rooms:
+            part = room.senses.capture(self._views(room.rows), self._first_seen, room.rows, self.steps[room.rows])
+            for column in fields(Perception):
+                getattr(whole, column.name)[room.rows] = getattr(part, column.name)
+        return whole
 
-    def _centre(self, depth: Float) -> Float:
-        middle = depth[:, self.settings.height // 2, self.settings.width // 2]
-        return np.where(middle > 0, middle, self.settings.max_range_m)
+    def _facts(self, actions: NDArray[np.integer], new_cells: NDArray[np.integer]) -> StepFacts:
+        from avp_habitat.history import history
 
-    def _new_cells(self, sensor: Float, depth: Float) -> NDArray[np.bool_]:
-        """`(n, m)` navigable cells that the agents' newest views observe for the first time."""
-        settings, area = self.settings, self.simulator.area
-        unseen = self.first_seen == 0
-        if settings.coverage_mode == "over":
-            return unseen & cells_passed_over(
-                sensor,
-                self._intrinsics,
-                depth,
-                self._cell_index,
-                area.origin,
-                cell_m=area.cell_m,
-                cells=self._cells,
-                max_range_m=settings.max_range_m,
-            )
-        pairs = candidates(sensor, self._intrinsics, area.centres, unseen, max_range_m=settings.max_range_m)
-        reached = self.simulator.visible(sensor, area.centres, pairs, tolerance_m=settings.tolerance_m)
-        new = np.zeros_like(unseen)
-        new[pairs[reached, 0], pairs[reached, 1]] = True
-        return new
-
-    def _facts(self, actions: NDArray[np.integer], new: NDArray[np.bool_]) -> StepFacts:
+        constants = self.settings.constants
+        past = history(
+            self._path,
+            self._angles,
+            self._cell,
+            self.steps,
+            distance_m=constants.redundancy_distance_m,
+            angle_rad=float(np.radians(constants.redundancy_angle_deg)),
+        )
         return StepFacts(
-            new_cells=new.sum(axis=1),
-            earlier_visits=self._earlier_visits(),
-            spread_m=self._spread(np.arange(self.agents)),
+            new_cells=new_cells,
+            earlier_visits=past.earlier_visits,
+            spread_m=past.spread_m,
             collided=self._collided,
-            redundant=self._redundant(),
+            redundant=past.redundant,
             stop_chosen=(actions == STOP) & has_stop(self.settings.reward),
             coverage=self.coverage,
             steps_left=self.settings.budget - self.steps,
         )
 
-    def _earlier(self) -> NDArray[np.bool_]:
-        """`(n, T)` which of the steps 1 … T came before the newest one."""
-        return np.arange(1, self.settings.budget + 1) < self.steps[:, None]
-
-    def _earlier_visits(self) -> NDArray[np.int64]:
-        """`(n,)` v: earlier views taken from the cell in which the agent now stands."""
-        area = self.simulator.area
-        visited = area.cell_of(self._path[:, 1:].reshape(-1, 3)).reshape(self.agents, -1, 2)
-        same = (visited == area.cell_of(self.position)[:, None]).all(axis=-1)
-        return np.count_nonzero(same & self._earlier(), axis=1)
-
-    def _redundant(self) -> NDArray[np.bool_]:
-        """`(n,)` whether an earlier view lies within d_red with both angles within δ."""
-        constants = self.settings.constants
-        near = np.linalg.norm(self._path[:, 1:] - self.position[:, None], axis=-1) < constants.redundancy_distance_m
-        now = np.stack([self.yaw, self.pitch], axis=1)[:, None]
-        turned = np.abs(poses.wrap_angle(self._angles[:, 1:] - now))
-        alike = (turned < np.radians(constants.redundancy_angle_deg)).all(axis=-1)
-        return (near & alike & self._earlier()).any(axis=1)
-
-    def _spread(self, rows: NDArray[np.integer]) -> Float:
-        """`(len(rows),)` ‖p − p̄‖ in metres on the floor plane, p̄ over the start and all steps so far."""
-        visited = np.arange(self.settings.budget + 1) <= self.steps[rows, None]
-        plane = self._path[rows][..., [0, 2]]
-        mean = (plane * visited[..., None]).sum(axis=1) / visited.sum(axis=1, keepdims=True)
-        return np.linalg.norm(self.position[rows][:, [0, 2]] - mean, axis=1)
-
-    def _observe(self, rows: NDArray[np.integer], depth: Float) -> NDArray[np.float32]:
-        radius = self.simulator.area.diameter_m
-        least, mean = depth_statistics(depth, self.settings.max_range_m)
-        return observation(
+    def _observe(self, rows: Rows, seen: Perception, spread_m: Float) -> NDArray[np.float32]:
+        radius = self._diameter[rows]
+        numbers = observation(
             progress=self.steps[rows] / self.settings.budget,
-            offset=(self.position[rows] - self._path[rows, 0])[:, [0, 2]] / radius,
+            offset=(self.position[rows] - self._path[rows, 0])[:, [0, 2]] / radius[:, None],
             yaw=self.yaw[rows],
             pitch=self.pitch[rows],
-            min_depth=least,
-            mean_depth=mean,
+            min_depth=seen.least,
+            mean_depth=seen.mean,
             coverage=self.coverage[rows],
             collided=self._collided[rows],
-            spread=self._spread(rows) / radius,
+            spread=spread_m / radius,
         )
+        if self.settings.observation == "numbers":
+            return numbers
+        maps = np.empty((len(rows), MAP_SIZE), dtype=np.float32)
+        for room, chosen in self._by_room(rows):
+            at = rows[chosen]
+            maps[chosen] = room.maps.observe(self._first_seen, at, self.position[at], self.yaw[at])
+        return np.concatenate([numbers, maps], axis=1)
 
     def _record(
         self, actions: NDArray[np.integer], reward: Float, parts: dict[str, NDArray[np.float64]], facts: StepFacts
@@ -288,7 +317,7 @@ class ViewpointTask:
             **{f"part {name}": values for name, values in parts.items()},
         }
         for name, values in columns.items():
-            self._log[name][np.arange(self.agents), self.steps - 1] = values
+            self._log[name][self._everyone, self.steps - 1] = values
 
 
 def episode_metrics(trajectory: Trajectory, *, stopped: bool) -> dict[str, float]:

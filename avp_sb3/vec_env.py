@@ -1,4 +1,4 @@
-"""Many agents of one scene as one Stable-Baselines3 `VecEnv`: one task, and one call for all their rays."""
+"""Many agents in one or more scenes as one Stable-Baselines3 `VecEnv`: one task, and one call for all their views."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from avp_habitat.env import step_info
 from avp_habitat.errors import UsageError
-from avp_habitat.observation import HIGH, LOW
+from avp_habitat.observation import observation_bounds
 from avp_habitat.poses import Intrinsics
 from avp_habitat.settings import ACTION_NAMES, TaskSettings
 from avp_habitat.simulators import Frames, Simulator, make_simulator
@@ -21,68 +21,54 @@ from avp_habitat.task import ViewpointTask
 class AVPVecEnv(VecEnv):
     """n agents of `AVP-v0`; the same task, observations, rewards and `info` as n separate `AVPEnv`s.
 
-    Wrap it in SB3's `VecMonitor` for the episode rewards and lengths that SB3 prints.
+    Wrap it in SB3's `VecMonitor` for the episode rewards and lengths that SB3 prints. `settings.lookup=True` makes it
+    several times faster (see `avp_habitat.lookup`).
     """
 
     def __init__(
         self,
-        scene: str = "builtin:0",
+        scene: str | Sequence[str] = "builtin:0",
         *,
         agents: int = 16,
-        simulator: str | Simulator = "raycast",
+        simulator: str | Simulator | Sequence[Simulator] = "raycast",
         settings: TaskSettings | None = None,
         seed: int | None = None,
     ) -> None:
-        """Open a scene for n agents.
+        """Open the scenes for n agents.
 
         Args:
-            scene: a mesh file, or `builtin:SEED`.
-            agents: n, at least 1.
-            simulator: a simulator's name, or one that is open already.
+            scene: a mesh file, or `builtin:SEED`, or several; agent i walks in scene i modulo their number.
+            agents: n, at least 1, and at least one for each scene.
+            simulator: a simulator's name, or those that are open already, one for each scene (names are then theirs).
             settings: of the task; the design's defaults when omitted.
             seed: of the starts; agent i uses `seed + i`, as SB3 seeds separate environments.
 
         Raises:
-            UsageError: fewer than one agent, or an unknown name.
-            SceneError: the scene cannot be used.
+            UsageError: too few agents, or an unknown name.
+            SceneError: a scene cannot be used; the text names it.
             SimulatorError: the simulator cannot run here.
         """
-        if agents < 1:
-            raise UsageError(f"agents: expected at least 1, got {agents}")
         self.settings = settings or TaskSettings()
-        self.simulator = make_simulator(simulator, scene) if isinstance(simulator, str) else simulator
+        self.simulators = _open(scene, simulator)
+        if agents < len(self.simulators):
+            raise UsageError(f"agents: expected at least {len(self.simulators)}, one for each scene, got {agents}")
         self.render_mode = None
         super().__init__(
             agents,
-            gymnasium.spaces.Box(LOW, HIGH, dtype=np.float32),
+            gymnasium.spaces.Box(*observation_bounds(self.settings.observation), dtype=np.float32),
             gymnasium.spaces.Discrete(len(ACTION_NAMES)),
         )
-        self._task = ViewpointTask(self.simulator, self.settings, agents)
+        self._task = ViewpointTask(self.simulators, self.settings, agents)
         self._generators = [np.random.default_rng() for _ in range(agents)]
         self._actions = np.zeros(agents, dtype=np.int64)
         self.seed(seed)
 
-    @property
-    def area(self) -> Any:
-        """The scene's `NavigableArea`."""
-        return self.simulator.area
-
-    @property
-    def scene_name(self) -> str:
-        """What the user called the scene, without folders."""
-        return self.simulator.scene
-
-    @property
-    def scene_digest(self) -> str:
-        """Hexadecimal SHA-256 of the scene's content."""
-        return self.simulator.scene_digest
-
-    def capture(self, camera_to_world: NDArray[np.floating], intrinsics: Intrinsics) -> Frames:
-        """Pictures and depth of `(k, 4, 4)` habitat poses, without any effect on the episodes."""
-        return self.simulator.render(camera_to_world, intrinsics, rgb=True)
+    def capture(self, row: int, camera_to_world: NDArray[np.floating], intrinsics: Intrinsics) -> Frames:
+        """Pictures and depth of `(k, 4, 4)` habitat poses in an agent's scene, without any effect on the episodes."""
+        return self._task.simulator(row).render(camera_to_world, intrinsics, rgb=True)
 
     def reset(self) -> NDArray[np.float32]:  # type: ignore[override]
-        """Start all episodes at random; `(n, 12)`."""
+        """Start all episodes at random; `(n, 12)`, longer with a map."""
         for index, seed in enumerate(self._seeds):
             if seed is not None:
                 self._generators[index] = np.random.default_rng(seed)
@@ -99,7 +85,7 @@ class AVPVecEnv(VecEnv):
         """Step all agents; those whose episode ended start the next one, as SB3 expects."""
         outcome = self._task.step(self._actions)
         done = outcome.terminated | outcome.truncated
-        infos = [step_info(self._task, outcome, row) for row in range(self.num_envs)]
+        infos = step_info(self._task, outcome)
         observation = outcome.observation
         ended = np.flatnonzero(done)
         for row in ended:
@@ -110,33 +96,56 @@ class AVPVecEnv(VecEnv):
         return observation, outcome.reward.astype(np.float32), done, infos
 
     def close(self) -> None:
-        """Nothing to free: the simulator is shared and goes with its last user."""
+        """Nothing to free: the simulators are shared and go with their last user."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of the chosen agents' environments."""
-        rows = self._get_indices(indices)
-        if attr_name == "centre_depth":
-            return [float(self._task.centre_depth[row]) for row in rows]
-        if attr_name == "camera_to_world":
-            return [self._task.camera_to_world[row] for row in rows]
-        if attr_name == "agent_view":
-            return [self._task.agent_view(row) for row in rows]
-        return [getattr(self, attr_name) for _ in rows]
+        """An attribute of the chosen agents, as separate `AVPEnv`s have it."""
+        read = _OF_AGENT.get(attr_name)
+        if read is None:
+            return [getattr(self, attr_name) for _ in self._get_indices(indices)]
+        return [read(self._task, row) for row in self._get_indices(indices)]
+
+    def has_attr(self, attr_name: str) -> bool:
+        """Whether `get_attr` knows the name."""
+        return attr_name in _OF_AGENT or hasattr(self, attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Refused: the agents share one task, whose settings are frozen."""
         raise UsageError(f"AVPVecEnv: {attr_name} cannot be set after the environment was made; give it as settings")
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Call a method once for each chosen agent."""
-        return [getattr(self, method_name)(*args, **kwargs) for _ in self._get_indices(indices)]
+        """Call a method once for each chosen agent; `capture` looks into that agent's scene."""
+        rows = self._get_indices(indices)
+        if method_name == "capture":
+            return [self.capture(row, *args, **kwargs) for row in rows]
+        return [getattr(self, method_name)(*args, **kwargs) for _ in rows]
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """No agent has a Gymnasium wrapper."""
         return [False for _ in self._get_indices(indices)]
 
     def _restart(self, rows: Sequence[int]) -> NDArray[np.float32]:
-        area = self.simulator.area
-        position = np.concatenate([area.random_points(self._generators[row], 1) for row in rows])
-        yaw = np.array([self._generators[row].uniform(-np.pi, np.pi) for row in rows])
+        draws = [(self._task.simulator(row).area, self._generators[row]) for row in rows]
+        position = np.concatenate([area.random_points(generator, 1) for area, generator in draws])
+        yaw = np.array([generator.uniform(-np.pi, np.pi) for _, generator in draws])
         return self._task.reset(rows, position, yaw)
+
+
+_OF_AGENT = {
+    "area": lambda task, row: task.simulator(row).area,
+    "scene_name": lambda task, row: task.simulator(row).scene,
+    "scene_digest": lambda task, row: task.simulator(row).scene_digest,
+    "simulator": lambda task, row: task.simulator(row),
+    "centre_depth": lambda task, row: task.centre_depth(row),
+    "camera_to_world": lambda task, row: task.camera_to_world[row],
+    "agent_view": lambda task, row: task.agent_view(row),
+}
+
+
+def _open(scene: str | Sequence[str], simulator: str | Simulator | Sequence[Simulator]) -> list[Simulator]:
+    if not isinstance(simulator, str):
+        return list(simulator) if isinstance(simulator, Sequence) else [simulator]
+    scenes = [scene] if isinstance(scene, str) else list(scene)
+    if not scenes:
+        raise UsageError("scene: expected at least one, got none")
+    return [make_simulator(simulator, name) for name in scenes]

@@ -152,7 +152,7 @@ def test_three_agents_at_once_do_what_one_does_by_hand(reward):
             met["visits"] += int(facts.earlier_visits[0])
         np.testing.assert_allclose(outcome.observation, [agent.observation() for agent in by_hand], atol=1e-5)
     for i, agent in enumerate(by_hand):
-        assert {cell: step for cell, step in enumerate(task.first_seen[i]) if step} == agent.seen
+        assert {cell: step for cell, step in enumerate(task.first_seen(i)) if step} == agent.seen
     assert met["collided"]
     assert met["redundant"]
     assert met["visits"]
@@ -216,9 +216,9 @@ def test_a_second_episode_remembers_nothing_and_leaves_other_agents_alone():
     start = np.array([[1.0, 0, 1.5], [4.0, 0, 2.0]])
     task.reset([0, 1], start, np.array([0.1, 2.0]))
     first = [task.step(np.array([action, action])) for action in (0, 1, 0)]
-    seen = task.first_seen[1].copy()
+    seen = task.first_seen(1).copy()
     task.reset([0], start[:1], np.array([0.1]))
-    np.testing.assert_array_equal(task.first_seen[1], seen)
+    np.testing.assert_array_equal(task.first_seen(1), seen)
     assert task.steps.tolist() == [0, 3]
     again = [task.step(np.array([action, STOP])) for action in (0, 1, 0)]
     for old, new in zip(first, again, strict=True):

@@ -75,6 +75,28 @@ class NavigableArea:
 
         return are_inside(self._walls, _on_plane(points))
 
+    def nearest(self, points: Float) -> Float:
+        """`(n, 3)` the points themselves where they lie over the area, else the nearest place of its outline.
+
+        Heights stay as they are.
+        """
+        points = np.array(points, dtype=np.float64)
+        outside = np.flatnonzero(~self.contains(points))
+        if len(outside):
+            points[np.ix_(outside, [0, 2])] = self._nearest_on_outline(_on_plane(points[outside]))
+        return points
+
+    def _nearest_on_outline(self, on_plane: Float) -> Float:
+        begin = np.concatenate(self.rings)
+        along = np.concatenate([np.roll(ring, -1, axis=0) for ring in self.rings]) - begin
+        squared = np.maximum((along**2).sum(axis=1), 1e-12)
+        nearest = np.empty_like(on_plane)
+        for index, point in enumerate(on_plane):
+            share = np.clip(((point - begin) * along).sum(axis=1) / squared, 0, 1)
+            foot = begin + share[:, None] * along
+            nearest[index] = foot[((foot - point) ** 2).sum(axis=1).argmin()]
+        return nearest
+
     def floor_height(self, points: Float) -> Float:
         """`(n,)` floor heights y in metres under `(n, 3)` points, linear between the centres of cells."""
         points = np.asarray(points, dtype=np.float64)

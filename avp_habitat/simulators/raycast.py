@@ -132,6 +132,18 @@ class RaycastSimulator:
         reached[far] = ~self._rays.blocked(rays)
         return reached
 
+    def distance(self, origin: NDArray[np.floating], direction: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Length of rays up to the first surface.
+
+        Args:
+            origin: `(k, 3)` metres, world frame.
+            direction: `(k, 3)` unit vectors.
+
+        Returns:
+            `(k,)` metres, inf where a ray leaves the scene.
+        """
+        return self._rays.cast(np.concatenate([origin, direction], axis=1).astype(np.float32))["t_hit"]
+
     def surface_below(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
         """Height of the first surface straight below each point.
 

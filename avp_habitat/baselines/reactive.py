@@ -1,4 +1,4 @@
-"""Policies that learn nothing, with Stable-Baselines3's `predict` interface."""
+"""Baselines without memory: the random policy and the heuristic of Eq. 23."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,0 +1,82 @@
+"""Finished tiles of tables on disk, so that a scene's rays are cast once and not once per training."""
+
+import os
+import tempfile
+import warnings
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+ENVIRONMENT = "AVP_CACHE"
+"""Environment variable that names the folder of the cache; empty keeps nothing on disk."""
+
+
+def cache_folder() -> Path | None:
+    """Where tables are kept: `$AVP_CACHE`, else `avp` in the user's cache folder; None when `$AVP_CACHE` is empty."""
+    chosen = os.environ.get(ENVIRONMENT)
+    if chosen is not None:
+        return Path(chosen) if chosen else None
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "avp"
+
+
+class TileFiles:
+    """The files of one scene's tables; a file that cannot be used is made anew, one that cannot be written is missed."""
+
+    def __init__(self, name: str) -> None:
+        """Use the folder `name` of the cache."""
+        folder = cache_folder()
+        self._folder = None if folder is None else folder / "tables" / name
+
+    def read(
+        self,
+        tile: tuple[int, int],
+        points: NDArray[np.integer],
+        visible_like: NDArray[np.uint64],
+        statistics_like: NDArray[np.uint16],
+    ) -> tuple[NDArray[np.uint64], NDArray[np.uint16]] | None:
+        """A tile's tables, or None where there is no sound file for these `(k, 2)` points and shapes."""
+        if self._folder is None:
+            return None
+        try:
+            with np.load(self._path(self._folder, tile), allow_pickle=False) as file:
+                found, visible, statistics = file["points"], file["visible"], file["statistics"]
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return None
+        sound = (
+            np.array_equal(found, points)
+            and (visible.dtype, visible.shape) == (visible_like.dtype, (len(points), *visible_like.shape[1:]))
+            and (statistics.dtype, statistics.shape)
+            == (statistics_like.dtype, (len(points), *statistics_like.shape[1:]))
+        )
+        return (visible, statistics) if sound else None
+
+    def write(
+        self,
+        tile: tuple[int, int],
+        points: NDArray[np.integer],
+        visible: NDArray[np.uint64],
+        statistics: NDArray[np.uint16],
+    ) -> None:
+        """Keep a tile; a full or read-only disk costs a warning."""
+        if self._folder is None:
+            return
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            # Another process may write the same tile: each writes its own file, and the last rename wins.
+            with tempfile.NamedTemporaryFile(dir=self._folder, suffix=".part", delete=False) as file:
+                try:
+                    np.savez(file, points=points, visible=visible, statistics=statistics)
+                    file.close()
+                    os.replace(file.name, self._path(self._folder, tile))
+                except BaseException:
+                    os.unlink(file.name)
+                    raise
+        except OSError as error:
+            warnings.warn(f"{self._folder}: tables are not kept: {error}", stacklevel=2)
+            self._folder = None
+
+    @staticmethod
+    def _path(folder: Path, tile: tuple[int, int]) -> Path:
+        return folder / f"tile_{tile[0]}_{tile[1]}.npz"

@@ -1,0 +1,119 @@
+"""Depth statistics of every view from a point, computed from one panorama of distances around that point.
+
+A panorama holds the inverse distance along directions on a regular grid of azimuth and elevation. Inverse distance is
+close to linear over the image of a plane, so values between the directions are interpolated bilinearly.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from avp_habitat.poses import Intrinsics, camera_to_world
+
+Float = NDArray[np.floating]
+
+STEP_DEG = 2.5
+"""Angle between neighbouring directions of a panorama, and half of that between neighbouring yaws of the statistics."""
+AZIMUTHS = round(360 / STEP_DEG)
+ELEVATIONS = round(180 / STEP_DEG) + 1
+YAWS = AZIMUTHS // 2
+PITCH_STEP_DEG = 10.0
+_COLUMNS, _ROWS = 20, 15
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Where the samples of a view lie in a panorama; every array is `(pitches, samples)`."""
+
+    azimuth: NDArray[np.float64]
+    """Position along the azimuths for yaw 0, in steps, within [0, AZIMUTHS)."""
+    elevation: NDArray[np.float64]
+    """Position along the elevations, in steps, within [0, ELEVATIONS - 1]."""
+    cosine: NDArray[np.float64]
+    """Planar depth over distance."""
+    inner: int
+    """The first so many samples fill the image evenly and give the mean; the others, on its border, only the least."""
+
+
+def directions() -> NDArray[np.float64]:
+    """`(AZIMUTHS, ELEVATIONS, 3)` unit vectors of a panorama, world frame; azimuth 0 is yaw 0, left is positive."""
+    azimuth = np.radians(STEP_DEG) * np.arange(AZIMUTHS)[:, None]
+    elevation = np.radians(STEP_DEG) * np.arange(ELEVATIONS)[None] - np.pi / 2
+    flat = np.cos(elevation)
+    parts = (-np.sin(azimuth) * flat, np.sin(elevation) + 0 * azimuth, -np.cos(azimuth) * flat)
+    return np.stack(np.broadcast_arrays(*parts), axis=-1)
+
+
+@lru_cache(maxsize=4)
+def view_samples(intrinsics: Intrinsics, pitches: tuple[float, ...]) -> Samples:
+    """The samples of views with the given pitches.
+
+    Args:
+        intrinsics: of the depth image whose statistics are wanted.
+        pitches: radians.
+    """
+    width, height = intrinsics.width, intrinsics.height
+    columns, rows = (np.arange(_COLUMNS) + 0.5) / _COLUMNS * width, (np.arange(_ROWS) + 0.5) / _ROWS * height
+    # The least depth often lies on the border (the floor at the lower one), so the outermost pixels are sampled too.
+    left, lower = np.array([0.5, width - 0.5]), np.array([0.5, height - 0.5])
+    grids = [np.meshgrid(columns, rows), np.meshgrid(columns, lower), np.meshgrid(left, rows), np.meshgrid(left, lower)]
+    u, v = (np.concatenate([grid[axis].ravel() for grid in grids]) for axis in (0, 1))
+    local = np.stack([(u - intrinsics.cx) / intrinsics.fx, -(v - intrinsics.cy) / intrinsics.fy, -np.ones_like(u)], 1)
+    length = np.linalg.norm(local, axis=1)
+    rotation = camera_to_world(np.zeros((len(pitches), 3)), yaw=np.zeros(len(pitches)), pitch=np.array(pitches))
+    world = np.einsum("pij,sj->psi", rotation[:, :3, :3], local / length[:, None])
+    azimuth = np.degrees(np.arctan2(-world[..., 0], -world[..., 2])) / STEP_DEG % AZIMUTHS
+    elevation = (np.degrees(np.arcsin(np.clip(world[..., 1], -1, 1))) + 90) / STEP_DEG
+    return Samples(azimuth, elevation, np.broadcast_to(1 / length, azimuth.shape).copy(), _COLUMNS * _ROWS)
+
+
+def view_statistics(distance: Float, samples: Samples, max_range_m: float) -> NDArray[np.uint16]:
+    """Least and mean planar depth of the views from k points, for all yaws and pitches.
+
+    Args:
+        distance: `(k, AZIMUTHS, ELEVATIONS)` metres along `directions()`, inf where nothing is hit.
+        samples: of the views.
+        max_range_m: what the whole range of the numbers stands for; larger depths count as this.
+
+    Returns:
+        `(k, YAWS, pitches, 2)` least and mean depth as shares of the range, in units of 1 / 65535.
+    """
+    inverse = (1.0 / np.maximum(distance, 1e-3)).astype(np.float32)
+    result = np.empty((len(distance), YAWS, len(samples.azimuth), 2), np.uint16)
+    _statistics(inverse, samples.azimuth, samples.elevation, samples.cosine, samples.inner, max_range_m, result)
+    return result
+
+
+@njit(cache=True, fastmath=True)
+def _statistics(inverse, azimuth, elevation, cosine, inner, max_range_m, result):
+    azimuths, elevations = inverse.shape[1:]
+    yaws, pitches = result.shape[1:3]
+    stride = azimuths // yaws
+    count = azimuth.shape[1]
+    for pitch in range(pitches):
+        a0 = np.floor(azimuth[pitch]).astype(np.int64)
+        e0 = np.minimum(np.floor(elevation[pitch]).astype(np.int64), elevations - 2)
+        wa = (azimuth[pitch] - a0).astype(np.float32)
+        we = (elevation[pitch] - e0).astype(np.float32)
+        scale = (max_range_m / cosine[pitch]).astype(np.float32)
+        for k in range(len(inverse)):
+            around = inverse[k]
+            for yaw in range(yaws):
+                total, greatest = np.float32(0), np.float32(1)
+                for s in range(count):
+                    a = a0[s] + yaw * stride
+                    a = a - azimuths if a >= azimuths else a
+                    b = a + 1 if a + 1 < azimuths else 0
+                    e = e0[s]
+                    near = around[a, e] + we[s] * (around[a, e + 1] - around[a, e])
+                    far = around[b, e] + we[s] * (around[b, e + 1] - around[b, e])
+                    # Inverse depth in units of 1 / range, at least 1: a depth beyond the range counts as the range.
+                    value = max((near + wa[s] * (far - near)) * scale[s], np.float32(1))
+                    greatest = max(greatest, value)
+                    if s < inner:
+                        total += 1 / value
+                result[k, yaw, pitch, 0] = np.uint16(65535 / greatest + 0.5)
+                result[k, yaw, pitch, 1] = np.uint16(65535 * total / inner + 0.5)

@@ -1,0 +1,169 @@
+"""Per scene: which floor cells can be seen from a place, and the depth statistics of every view from it.
+
+From each point of a lattice over the floor, rays to all cells in range and all around are cast once. A place between
+the points takes its depth statistics from the four around it by bilinear interpolation. A cell that all four see is
+visible, one that none of them sees is hidden; the few on which they differ are left to a ray from the place itself.
+Tables are made tile by tile where agents come, so large scenes cost what is visited of them, and are kept on disk.
+"""
+
+import hashlib
+import weakref
+from dataclasses import astuple, dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.errors import UsageError
+from avp_habitat.lookup import panorama
+from avp_habitat.lookup.disk import TileFiles
+from avp_habitat.lookup.lattice import TILE, Lattice
+from avp_habitat.poses import Intrinsics, camera_to_world
+from avp_habitat.settings import TaskSettings
+from avp_habitat.simulators.base import Simulator
+
+SPACING_M = 0.1
+"""Distance between lattice points in metres. At 0.2 m the least depth is off by twice as much (docs/training.md)."""
+_VERSION = 1
+_PLACES_PER_CALL = 64
+
+
+@runtime_checkable
+class RaySimulator(Simulator, Protocol):
+    """A simulator that casts single rays."""
+
+    def distance(self, origin: NDArray[np.floating], direction: NDArray[np.floating]) -> NDArray[np.float32]:
+        """`(k,)` metres from `(k, 3)` origins along `(k, 3)` unit directions to the first surface, inf for none."""
+        ...
+
+
+@dataclass(frozen=True)
+class ViewKey:
+    """What the tables depend on besides the scene."""
+
+    sensor_height_m: float
+    """Height of the camera above the floor, metres."""
+    intrinsics: Intrinsics
+    """Of the depth image whose statistics are looked up."""
+    pitch_limit_deg: float
+    """Greatest pitch, degrees."""
+    max_range_m: float
+    """Range of the depth and of the coverage, metres."""
+    tolerance_m: float
+    """Of the coverage, metres."""
+    spacing_m: float = SPACING_M
+    """Of the lattice, metres."""
+
+    @property
+    def pitches(self) -> tuple[float, ...]:
+        """Pitches of the statistics in radians: multiples of 10° up to the limit, and one beyond unless it is one."""
+        most = int(np.ceil(self.pitch_limit_deg / panorama.PITCH_STEP_DEG - 1e-9))
+        return tuple(np.radians(panorama.PITCH_STEP_DEG * np.arange(-most, most + 1)).tolist())
+
+
+class SceneTables:
+    """The tables of one scene, growing with the places that were asked for."""
+
+    def __init__(self, simulator: RaySimulator, key: ViewKey) -> None:
+        """Make empty tables.
+
+        Args:
+            simulator: casts the rays.
+            key: of the views.
+        """
+        self._simulator = simulator
+        self.key = key
+        self._samples = panorama.view_samples(key.intrinsics, key.pitches)
+        self._directions = panorama.directions().reshape(-1, 3)
+        self.lattice = Lattice(simulator.area, key.spacing_m)
+        self._cells = len(simulator.area.centres)
+        self._slot = np.full(self.lattice.shape, -1, dtype=np.int32)
+        self._tiles: set[tuple[int, int]] = set()
+        self.visible = np.zeros((0, -(-self._cells // 64)), dtype=np.uint64)
+        """`(slots, words)`: bit c % 64 of word c // 64 says whether cell c is seen from the slot's place."""
+        self.statistics = np.zeros((0, panorama.YAWS, len(key.pitches), 2), dtype=np.uint16)
+        """`(slots, yaws, pitches, 2)` least and mean depth, 65535 for the whole range."""
+        name = hashlib.sha256(f"{simulator.scene_digest} {_VERSION} {astuple(key)}".encode()).hexdigest()[:32]
+        self._files = TileFiles(name)
+
+    def around(self, position: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        """The slots around places, made now where they are new.
+
+        Args:
+            position: `(k, 3)` feet, metres.
+
+        Returns:
+            `(k, 4)` slots and `(k, 4)` weights that sum to 1.
+        """
+        points, weight = self.lattice.around(position)
+        slots = self._slot[points[..., 0], points[..., 1]]
+        if (slots < 0).any():
+            self._make(points[slots < 0])
+            slots = self._slot[points[..., 0], points[..., 1]]
+        return slots, weight.astype(np.float32)
+
+    def _make(self, points: NDArray[np.integer]) -> None:
+        for tile in sorted({(int(i), int(j)) for i, j in points // TILE} - self._tiles):
+            self._tiles.add(tile)
+            wanted = self.lattice.points_of_tile(tile)
+            table = self._files.read(tile, wanted, self.visible, self.statistics)
+            if table is None:
+                table = self._compute(wanted)
+                self._files.write(tile, wanted, *table)
+            self._add(wanted, *table)
+        # An agent in a sliver of floor too thin to hold a cell's centre stands beside points that no tile has.
+        lacking = np.unique(points[self._slot[points[:, 0], points[:, 1]] < 0], axis=0)
+        if len(lacking):
+            self._add(lacking, *self._compute(lacking))
+
+    def _add(self, points: NDArray[np.integer], visible: NDArray[np.uint64], statistics: NDArray[np.uint16]) -> None:
+        self._slot[points[:, 0], points[:, 1]] = np.arange(len(points)) + len(self.visible)
+        self.visible = np.concatenate([self.visible, visible])
+        self.statistics = np.concatenate([self.statistics, statistics])
+
+    def _compute(self, points: NDArray[np.integer]) -> tuple[NDArray[np.uint64], NDArray[np.uint16]]:
+        eyes = self.lattice.feet(points) + [0.0, self.key.sensor_height_m, 0.0]
+        visible, statistics = [self.visible[:0]], [self.statistics[:0]]
+        for start in range(0, len(eyes), _PLACES_PER_CALL):
+            eye = eyes[start : start + _PLACES_PER_CALL]
+            visible.append(self._visible_from(eye))
+            statistics.append(self._statistics_from(eye))
+        return np.concatenate(visible), np.concatenate(statistics)
+
+    def _visible_from(self, eye: NDArray[np.floating]) -> NDArray[np.uint64]:
+        centres = self._simulator.area.centres
+        # A place is less than a lattice diagonal away from its points, so that cells a little out of range count too.
+        reach = self.key.max_range_m + 2 * self.key.spacing_m
+        pairs = np.argwhere(((centres[None] - eye[:, None]) ** 2).sum(axis=-1) < reach**2)
+        poses = camera_to_world(eye, yaw=np.zeros(len(eye)), pitch=np.zeros(len(eye)))
+        seen = self._simulator.visible(poses, centres, pairs, tolerance_m=self.key.tolerance_m)
+        bits = np.zeros((len(eye), self.visible.shape[1] * 64), dtype=np.bool_)
+        bits[pairs[seen, 0], pairs[seen, 1]] = True
+        return np.packbits(bits, axis=1, bitorder="little").view("<u8").astype(np.uint64)
+
+    def _statistics_from(self, eye: NDArray[np.floating]) -> NDArray[np.uint16]:
+        origin = np.repeat(eye, len(self._directions), axis=0)
+        distance = self._simulator.distance(origin, np.tile(self._directions, (len(eye), 1)))
+        around = distance.reshape(len(eye), panorama.AZIMUTHS, panorama.ELEVATIONS)
+        return panorama.view_statistics(around, self._samples, self.key.max_range_m)
+
+
+_shared: weakref.WeakKeyDictionary[Simulator, dict[ViewKey, SceneTables]] = weakref.WeakKeyDictionary()
+
+
+def scene_tables(simulator: Simulator, settings: TaskSettings) -> SceneTables:
+    """The tables for a scene and a task; tasks on the same open simulator share them.
+
+    Raises:
+        UsageError: the simulator cannot cast single rays.
+    """
+    if not isinstance(simulator, RaySimulator):
+        raise UsageError(f"lookup: expected the simulator 'raycast', got {simulator.name!r}; leave lookup off")
+    key = ViewKey(
+        sensor_height_m=settings.sensor_height_m,
+        intrinsics=settings.intrinsics,
+        pitch_limit_deg=settings.pitch_limit_deg,
+        max_range_m=settings.max_range_m,
+        tolerance_m=settings.tolerance_m,
+    )
+    return _shared.setdefault(simulator, {}).setdefault(key, SceneTables(simulator, key))
