@@ -12,12 +12,12 @@ from typing import Any
 from tqdm import tqdm
 
 from avp_habitat import command
-from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.errors import UsageError
 from avp_habitat.policies import POLICY_NAMES
 from avp_habitat.rewards import REWARD_NAMES
-from avp_habitat.settings import TaskSettings
+from avp_habitat.settings import OBSERVATION_NAMES, TaskSettings
 from avp_habitat.simulators import SIMULATOR_NAMES
-from avp_sb3.evaluation import OBSERVATIONS, Contestant, EpisodeResult, PolicyResult, run_episodes
+from avp_sb3.evaluation import Contestant, EpisodeResult, PolicyResult, run_episodes
 from avp_sb3.evaluation_report import check_new, table, write_report
 
 EXPERIMENT = "avp-evaluation"
@@ -40,7 +40,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--episodes", default=20, type=int, help="per policy (default: %(default)s)")
     add("--seed", default=1000, type=int, help="of the first start; episode i uses SEED + i (default: %(default)s)")
     add("--reward", default="proposed", metavar="REWARD", help=f"{', '.join(REWARD_NAMES)} (default: %(default)s)")
-    add("--observation", default=None, metavar="KIND", help=f"{', '.join(OBSERVATIONS)} (default: the model's own)")
+    add(
+        "--observation", default=None, metavar="KIND", help=f"{', '.join(OBSERVATION_NAMES)} (default: the model's own)"
+    )
     add("--simulator", default="raycast", metavar="NAME", help=f"{', '.join(SIMULATOR_NAMES)} (default: %(default)s)")
     add("--budget", default=80, type=int, help="steps, which are views (default: %(default)s)")
     add("--width", default=160, type=int, help="of the policy's depth image in pixels (default: %(default)s)")
@@ -58,8 +60,6 @@ def _options(argv: Sequence[str]) -> argparse.Namespace:
         raise UsageError(f"--episodes: expected at least 1, got {options.episodes}")
     if options.seed < 0:
         raise UsageError(f"--seed: expected a whole number from 0, got {options.seed}")
-    if options.observation not in (None, *OBSERVATIONS):
-        raise unknown_name("observation", options.observation, OBSERVATIONS)
     if options.out is None:
         options.out = Path("runs") / f"evaluation-{datetime.now():%Y%m%d-%H%M%S}"
     check_new(options.out)
@@ -137,7 +137,7 @@ def _about(
 ) -> dict[str, Any]:
     env = contestant.env
     settings = asdict(env.settings)
-    settings.pop("observation", None)  # Each policy has its own.
+    del settings["observation"]  # Each policy has its own.
     return {
         "command": shlex.join(["python", "-m", "avp_sb3.evaluate", *argv]),
         "complete": complete,

@@ -11,14 +11,12 @@ from avp_habitat.env import AVPEnv
 from avp_habitat.episode import steps_of
 from avp_habitat.errors import PolicyError
 from avp_habitat.policies import Policy, check_policy, make_policy
-from avp_habitat.settings import TaskSettings
+from avp_habitat.settings import OBSERVATION_NAMES, TaskSettings
 from avp_habitat.simulators import make_simulator
 from avp_sb3.evaluation_statistics import held_curve
 
 COVERAGE_AFTER = (20, 40, 60, 80)
 """Views after which the coverage is a figure of its own, as far as the budget reaches."""
-OBSERVATIONS = ("numbers", "map")
-"""Kinds of observation, in the order in which a model is tried with them."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +101,12 @@ class Contestant:
         self.name = check_policy(policy)
         self._stochastic = stochastic
         opened = make_simulator(simulator, scene)
-        kinds = OBSERVATIONS if observation is None else (observation,)
-        envs = (AVPEnv(scene, simulator=opened, settings=_exact(settings, kind)) for kind in kinds)
+        # A model is tried with each kind; a baseline fits the first.
+        kinds = OBSERVATION_NAMES if observation is None else (observation,)
+        envs = (
+            AVPEnv(scene, simulator=opened, settings=replace(settings, lookup=False, observation=kind))
+            for kind in kinds
+        )
         self.env, self._policy = _first_fit(policy, envs)
 
     @property
@@ -115,7 +117,7 @@ class Contestant:
     @property
     def observation(self) -> str:
         """Kind of observation in use."""
-        return getattr(self.env.settings, "observation", OBSERVATIONS[0])
+        return self.env.settings.observation
 
     def run(self, seed: int) -> EpisodeResult:
         """One episode; it depends on the seed alone, not on the episodes before it."""
@@ -172,11 +174,6 @@ def run_episodes(
     for number in range(episodes):
         yield contestant.run(seed + number)
         on_episode()
-
-
-def _exact(settings: TaskSettings, observation: str) -> TaskSettings:
-    changes = {"lookup": False, "observation": observation}
-    return replace(settings, **{name: value for name, value in changes.items() if hasattr(settings, name)})
 
 
 def _first_fit(policy: str, envs: Iterable[AVPEnv]) -> tuple[AVPEnv, Policy]:

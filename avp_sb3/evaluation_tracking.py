@@ -10,10 +10,11 @@ import mlflow
 import numpy as np
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, RunTag
+from mlflow.exceptions import MlflowException
 from mlflow.tracking.context.registry import resolve_tags
 
 from avp_sb3.evaluation import PolicyResult
-from avp_sb3.evaluation_report import summary
+from avp_sb3.evaluation_report import ReportError, summary
 from avp_sb3.evaluation_statistics import mean_and_half_width
 from avp_sb3.mlflow_callback import DEFAULT_TRACKING_URI
 from avp_sb3.mlflow_writer import safe_name
@@ -43,16 +44,27 @@ def track_evaluation(
         experiment: MLflow experiment, made when it does not exist.
         complete: False marks the runs as interrupted.
 
+    Raises:
+        ReportError: MLflow failed; the report is on disk.
+
     Returns:
         The upper run's id and the address of the store: what is configured, else `sqlite:///mlflow.db`.
     """
+    try:
+        return _log(results, about, folder, experiment, "FINISHED" if complete else "KILLED")
+    except (MlflowException, OSError) as error:
+        raise ReportError(f"the report is in {folder}, but MLflow did not take it: {error}") from error
+
+
+def _log(
+    results: Sequence[PolicyResult], about: Mapping[str, Any], folder: Path, experiment: str, status: str
+) -> tuple[str, str]:
     client = MlflowClient(mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else DEFAULT_TRACKING_URI)
     found = client.get_experiment_by_name(experiment)
     identity = found.experiment_id if found else client.create_experiment(experiment)
     tags = dict(resolve_tags()) | version_tags()
     if (commit := git_commit()) is not None:
         tags["mlflow.source.git.commit"] = commit
-    status = "FINISHED" if complete else "KILLED"
     params = _params(about)
     parent = client.create_run(identity, run_name="evaluation", tags=tags).info.run_id
     client.log_batch(parent, params=params)

@@ -1,5 +1,6 @@
 """The hook by which rl_zoo3 steps its environments as one batch: `vec_env_wrapper: avp_sb3.zoo.Batched`."""
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -11,15 +12,16 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 from avp_habitat.env import AVPEnv
 from avp_habitat.errors import UsageError
 from avp_habitat.settings import TaskSettings
-from avp_habitat.simulators import Simulator
+from avp_habitat.simulators import Simulator, make_simulator
 from avp_sb3.vec_env import AVPVecEnv
 
 _REPLACED = (Monitor, OrderEnforcing, PassiveEnvChecker)
 """Wrappers whose work the batch does itself, or does not need."""
 _WITH_LOOKUP = "raycast"
+_HOOK = "avp_sb3.zoo.Batched"
 
 
-def Batched(venv: VecEnv, *, lookup: bool = True) -> VecEnv:
+def Batched(venv: VecEnv, *, scenes: Sequence[str] = (), lookup: bool = True) -> VecEnv:
     """The same agents as one `AVPVecEnv` within a `VecMonitor`: same scenes, settings and starts, stepped as arrays.
 
     Left as they are: environments in processes of their own (`--vec-env subproc`), and those that are rendered,
@@ -27,22 +29,23 @@ def Batched(venv: VecEnv, *, lookup: bool = True) -> VecEnv:
 
     Args:
         venv: what rl_zoo3 made.
+        scenes: train in these, agent i in scene i modulo their number, instead of in the environments' own; a single
+            environment (rl_zoo3's evaluation, `enjoy`) keeps its own scene.
         lookup: look visibility up in tables per scene where the simulator casts rays; False casts them.
 
     Raises:
-        UsageError: an environment is no `AVPEnv`, or their settings differ.
+        UsageError: an environment is no `AVPEnv`, their settings differ, they are fewer than the scenes, or there are
+            scenes for environments that are left as they are.
+        SceneError: one of the scenes cannot be used.
     """
     if not isinstance(venv, DummyVecEnv):
-        return venv
+        return _left_alone(venv, "they are in processes of their own", scenes)
     envs = [_avp_env(env) for env in venv.envs]
     if (reason := _reason_to_leave(venv.envs)) is not None:
-        print(f"Batched: the environments are stepped one by one: {reason}")
-        return venv
-    simulators = _shortest_cycle([env.simulator for env in envs])
+        return _left_alone(venv, reason, scenes)
     batch = AVPVecEnv(
-        simulators[0].scene,
         agents=len(envs),
-        simulator=simulators[0] if len(simulators) == 1 else simulators,
+        simulator=_simulators(envs, scenes),
         settings=_settings(envs, lookup=lookup),
         seed=venv._seeds[0],
     )
@@ -51,11 +54,18 @@ def Batched(venv: VecEnv, *, lookup: bool = True) -> VecEnv:
     return VecMonitor(batch, filename=folder)
 
 
+def _left_alone(venv: VecEnv, reason: str, scenes: Sequence[str]) -> VecEnv:
+    if scenes and venv.num_envs > 1:
+        raise UsageError(f"{_HOOK}: scenes: expected environments that can be stepped as one batch, but {reason}")
+    print(f"{_HOOK}: the environments are stepped one by one: {reason}")
+    return venv
+
+
 def _avp_env(env: gymnasium.Env) -> AVPEnv:
     inner = env.unwrapped
     if not isinstance(inner, AVPEnv):
         name = type(inner).__name__
-        raise UsageError(f"vec_env_wrapper avp_sb3.zoo.Batched: expected environments of AVP-v0, got {name}")
+        raise UsageError(f"{_HOOK}: expected environments of AVP-v0, got {name}")
     return inner
 
 
@@ -63,10 +73,10 @@ def _reason_to_leave(envs: list[gymnasium.Env]) -> str | None:
     """What the batch would leave out; None when it would leave out nothing."""
     for env in envs:
         if env.render_mode is not None:
-            return f"render_mode {env.render_mode!r}"
+            return f"they render (render_mode {env.render_mode!r})"
         while isinstance(env, gymnasium.Wrapper):
             if not isinstance(env, _REPLACED):
-                return f"wrapped in {type(env).__name__}"
+                return f"they are wrapped in {type(env).__name__}"
             env = env.env
     return None
 
@@ -78,13 +88,23 @@ def _settings(envs: list[AVPEnv], *, lookup: bool) -> TaskSettings:
             first, other = getattr(settings, field.name), getattr(env.settings, field.name)
             if first != other:
                 raise UsageError(
-                    "vec_env_wrapper avp_sb3.zoo.Batched: expected the same settings in every environment, found "
-                    f"{field.name} {first!r} in number 0 and {other!r} in number {index}"
+                    f"{_HOOK}: expected the same settings in every environment, found {field.name} {first!r} in "
+                    f"number 0 and {other!r} in number {index}"
                 )
-    if "lookup" not in TaskSettings.__dataclass_fields__:
-        return settings
     rays = all(env.simulator.name == _WITH_LOOKUP for env in envs)
     return replace(settings, lookup=lookup and rays)
+
+
+def _simulators(envs: list[AVPEnv], scenes: Sequence[str]) -> list[Simulator]:
+    own = [env.simulator for env in envs]
+    if not scenes or len(envs) == 1:
+        return _shortest_cycle(own)
+    if len(envs) < len(scenes):
+        raise UsageError(
+            f"{_HOOK}: expected at least one environment for each of the {len(scenes)} scenes, got {len(envs)}; "
+            f"set n_envs:{len(scenes)} and n_steps so that their product is PPO's buffer"
+        )
+    return [make_simulator(own[0].name, scene) for scene in scenes]
 
 
 def _shortest_cycle(simulators: list[Simulator]) -> list[Simulator]:
