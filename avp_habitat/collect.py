@@ -16,7 +16,8 @@ from avp_habitat.env import AVPEnv
 from avp_habitat.episode import steps_of
 from avp_habitat.errors import UsageError
 from avp_habitat.heldout import VIEWS
-from avp_habitat.policies import POLICY_NAMES, Policy, check_policy, make_policy
+from avp_habitat.policies import POLICY_NAMES, Policy, check_policy
+from avp_habitat.policy_env import make_policy_env
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rewards import REWARD_NAMES
 from avp_habitat.rollout_capture import capture_heldout, capture_step, publish_rollout
@@ -62,8 +63,7 @@ def collect(request: Request) -> dict[str, Any]:
     check_policy(request.policy)
     with RolloutWriter(request.out, request.camera) as writer:
         simulator = make_simulator(request.simulator, request.scene)
-        env = AVPEnv(request.scene, simulator=simulator, settings=request.settings)
-        policy = make_policy(request.policy, env, request.seed)
+        env, policy = make_policy_env(request.policy, simulator, request.settings, seed=request.seed)
         total = request.settings.budget + request.heldout
         with tqdm(total=total, unit="view", desc=f"collecting {request.out}", disable=None) as progress:
             info = _capture_episode(request, env, policy, writer, progress)

@@ -1,17 +1,16 @@
 """Episodes of a policy on fixed starts, and the figures by which policies are compared."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.env import AVPEnv
 from avp_habitat.episode import steps_of
-from avp_habitat.errors import PolicyError
 from avp_habitat.policies import Policy, check_policy, make_policy
-from avp_habitat.settings import OBSERVATION_NAMES, TaskSettings
+from avp_habitat.policy_env import make_policy_env
+from avp_habitat.settings import TaskSettings
 from avp_habitat.simulators import make_simulator
 from avp_sb3.evaluation_statistics import held_curve
 
@@ -100,14 +99,9 @@ class Contestant:
         """
         self.name = check_policy(policy)
         self._stochastic = stochastic
-        opened = make_simulator(simulator, scene)
-        # A model is tried with each kind; a baseline fits the first.
-        kinds = OBSERVATION_NAMES if observation is None else (observation,)
-        envs = (
-            AVPEnv(scene, simulator=opened, settings=replace(settings, lookup=False, observation=kind))
-            for kind in kinds
+        self.env, self._policy = make_policy_env(
+            policy, make_simulator(simulator, scene), replace(settings, lookup=False), observation=observation
         )
-        self.env, self._policy = _first_fit(policy, envs)
 
     @property
     def training_run(self) -> str | None:
@@ -174,17 +168,6 @@ def run_episodes(
     for number in range(episodes):
         yield contestant.run(seed + number)
         on_episode()
-
-
-def _first_fit(policy: str, envs: Iterable[AVPEnv]) -> tuple[AVPEnv, Policy]:
-    first: PolicyError | None = None
-    for env in envs:
-        try:
-            return env, make_policy(policy, env, 0)
-        except PolicyError as error:
-            first = first or error
-    assert first is not None
-    raise first
 
 
 def _figures(coverage: list[float], episode: dict[str, float], budget: int) -> tuple[NDArray, dict[str, float]]:
