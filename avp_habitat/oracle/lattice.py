@@ -1,0 +1,192 @@
+"""What can be seen from where in a whole scene: a lattice of places on its floor, with tables of floor cells."""
+
+import weakref
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from avp_habitat.oracle.motion import sensor_poses
+from avp_habitat.poses import Intrinsics, pixel_directions
+from avp_habitat.settings import TaskSettings
+from avp_habitat.simulators.base import Simulator
+
+Float = NDArray[np.float64]
+Bits = NDArray[np.uint64]
+
+TABLE_ENTRIES = 30_000_000
+"""Most pairs of a place and a cell: one ray each to prepare, and two bytes each to keep."""
+_RAYS_PER_CALL = 1 << 20
+_NEAR_M = 1.0
+"""A cell nearer than this on the floor is below the image of a camera that looks ahead."""
+_AHEAD_M = 0.8
+"""The heading of a walk is that of the place so far along it."""
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Places, and which floor cells are not hidden from a camera above each of them; p places, m cells."""
+
+    places: Float
+    """`(p, 3)` floor points, metres."""
+    points: Float
+    """`(m, 3)` floor points of the navigable cells, metres."""
+    sees: Bits
+    """`(p, ceil(m / 64))` cells within range that a camera ray from above the place reaches, in any direction."""
+    wanted: Bits
+    """`(ceil(m / 64),)` cells seen from any place."""
+    reach: NDArray[np.uint8]
+    """`(p, m)` half steps of walking to the nearest place that sees the cell; `kernels.NEVER` for none."""
+    heading: NDArray[np.uint8]
+    """`(p, m)` 256ths of a turn: where to walk for it, or where the cell lies when it is in reach."""
+    neighbours: NDArray[np.int64]
+    """`(p, 8)` places beside each place to which the way is free, then -1."""
+    lengths_m: Float
+    """`(p, 8)` lengths of the ways to them, metres."""
+    tree: KDTree
+    """Of the places on the floor plane."""
+
+    def place_of(self, positions: Float) -> NDArray[np.int64]:
+        """`(n,)` numbers of the places nearest to `(n, 3)` points."""
+        return self.tree.query(positions[:, [0, 2]])[1].astype(np.int64)
+
+
+def pack(members: NDArray[np.bool_]) -> Bits:
+    """Bit sets `(n, ceil(m / 64))` of `(n, m)` truth values."""
+    n, m = members.shape
+    padded = np.zeros((n, -(-m // 64) * 64), dtype=np.bool_)
+    padded[:, :m] = members
+    return np.packbits(padded, axis=1, bitorder="little").view("<u8").astype(np.uint64)
+
+
+def unpack(sets: Bits, count: int) -> NDArray[np.bool_]:
+    """`(n, count)` truth values of `(n, words)` bit sets."""
+    return np.unpackbits(sets.astype("<u8").view(np.uint8), axis=1, bitorder="little")[:, :count].astype(np.bool_)
+
+
+def image_borders(pose: Float, intrinsics: Intrinsics) -> Float:
+    """`(n, 4, 3)` inward normals of the planes through `(n, 4, 4)` cameras and their images' borders.
+
+    In the order left, top, right, bottom; lengths are arbitrary.
+    """
+    width, height = intrinsics.width, intrinsics.height
+    # An image of 2 x 2 pixels whose pixel centres are the corners of the true image.
+    stretched = Intrinsics(
+        2,
+        2,
+        intrinsics.fx / width,
+        intrinsics.fy / height,
+        intrinsics.cx / width + 0.5,
+        intrinsics.cy / height + 0.5,
+    )
+    corner = pixel_directions(stretched)
+    bottom_left, top_left, top_right, bottom_right = corner[1, 0], corner[0, 0], corner[0, 1], corner[1, 1]
+    around = np.array([bottom_left, top_left, top_right, bottom_right])
+    local = np.cross(around, np.roll(around, -1, axis=0))
+    local *= np.sign(local @ around.sum(axis=0))[:, None]
+    return np.einsum("nij,kj->nki", pose[:, :3, :3], local)
+
+
+def views_from(lattice: Lattice, settings: TaskSettings, position: Float, yaw: Float, pitch: Float) -> Bits:
+    """`(n, words)` cells observed by the views of n agents; what is hidden is taken from the nearest places.
+
+    Args:
+        lattice: of the scene.
+        settings: of the task.
+        position: `(n, 3)` feet, metres.
+        yaw: `(n,)` radians.
+        pitch: `(n,)` radians.
+    """
+    from avp_habitat.oracle.kernels import look
+
+    n, words = len(position), len(lattice.wanted)
+    pose = sensor_poses(settings, position, yaw, pitch)
+    sets, gain, nobody = np.zeros((n, words), np.uint64), np.zeros(n, np.int64), np.zeros((1, words), np.uint64)
+    camera, normals = np.ascontiguousarray(pose[:, :3, 3]), image_borders(pose, settings.intrinsics)
+    place = lattice.place_of(position)
+    look(np.zeros(n, np.int64), place, camera, normals, lattice.sees, lattice.points, nobody, sets, gain)
+    return sets
+
+
+def lattice_of(simulator: Simulator, settings: TaskSettings) -> Lattice:
+    """The scene's lattice for these settings, prepared once per simulator object."""
+    key = (settings.sensor_height_m, settings.max_range_m, settings.tolerance_m, settings.forward_m)
+    known = _lattices.setdefault(simulator, {})
+    if key not in known:
+        known[key] = make_lattice(simulator, settings)
+    return known[key]
+
+
+_lattices: weakref.WeakKeyDictionary[Simulator, dict[tuple, Lattice]] = weakref.WeakKeyDictionary()
+
+
+def make_lattice(simulator: Simulator, settings: TaskSettings, *, entries: int = TABLE_ENTRIES) -> Lattice:
+    """Cast a ray from every place to every cell within range, and find the ways between the places.
+
+    Args:
+        simulator: of the scene.
+        settings: of the task: sensor height, range, tolerance, length of a move.
+        entries: most pairs of a place and a cell; the lattice's spacing is the smallest multiple of a cell that
+            keeps below.
+    """
+    from avp_habitat.oracle import kernels
+
+    area = simulator.area
+    stride, cells = _stride(area.mask, entries)
+    places, points = area.centres[cells], np.ascontiguousarray(area.centres)
+    sees = _unhidden(simulator, places, settings)
+    grid = np.full(area.mask.shape, -1, dtype=np.int64)
+    grid[tuple(np.argwhere(area.mask)[cells].T)] = np.arange(len(cells))
+    other, length = kernels.neighbour_table(np.ascontiguousarray(grid[::stride, ::stride]), len(cells))
+    spacing = stride * area.cell_m
+    reach, heading = kernels.reach_tables(
+        sees,
+        points,
+        places,
+        other,
+        length,
+        spacing / kernels.LENGTHS_PER_SPACING / settings.forward_m,
+        max(1, round(_AHEAD_M / spacing)),
+        _NEAR_M,
+    )
+    wanted = np.bitwise_or.reduce(sees, axis=0)
+    return Lattice(
+        places=places,
+        points=points,
+        sees=sees,
+        wanted=wanted,
+        reach=reach,
+        heading=heading,
+        neighbours=other,
+        lengths_m=np.asarray(length * spacing / kernels.LENGTHS_PER_SPACING, dtype=np.float64),
+        tree=KDTree(places[:, [0, 2]]),
+    )
+
+
+def _stride(mask: NDArray[np.bool_], entries: int) -> tuple[int, NDArray[np.int64]]:
+    """Spacing in cells, and the numbers of the navigable cells that are places."""
+    rows, columns = np.nonzero(mask)
+    stride = 0
+    while True:
+        stride += 1
+        cells = np.flatnonzero((rows % stride == 0) & (columns % stride == 0))
+        if len(cells) * len(rows) <= entries and len(cells):
+            return stride, cells
+
+
+def _unhidden(simulator: Simulator, places: Float, settings: TaskSettings) -> Bits:
+    points = simulator.area.centres
+    ahead = np.zeros(len(places))
+    pose = sensor_poses(settings, places, ahead, ahead)
+    chunk = max(1, _RAYS_PER_CALL // len(points))
+    sets = []
+    for start in range(0, len(places), chunk):
+        cameras = pose[start : start + chunk]
+        distance = np.linalg.norm(points[None] - cameras[:, None, :3, 3], axis=-1)
+        pairs = np.argwhere(distance <= settings.max_range_m)
+        reached = simulator.visible(cameras, points, pairs, tolerance_m=settings.tolerance_m)
+        members = np.zeros(distance.shape, dtype=np.bool_)
+        members[tuple(pairs[reached].T)] = True
+        sets.append(pack(members))
+    return np.concatenate(sets)
