@@ -1,14 +1,13 @@
 """Policies by name or by model file, as `collect` and evaluations ask for them."""
 
+import importlib
 import pickle
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
-from avp_habitat.baselines import HeuristicPolicy, RandomPolicy
 from avp_habitat.env import AVPEnv
 from avp_habitat.errors import PolicyError, UsageError, unknown_name
 
@@ -23,9 +22,13 @@ class Policy(Protocol):
         ...
 
 
-_BASELINES: dict[str, Callable[[AVPEnv, int], Policy]] = {
-    "heuristic": HeuristicPolicy.for_env,
-    "random": lambda env, seed: RandomPolicy(seed),
+# Where each baseline's class lies; its `for_env(env, seed)` is imported when it is asked for.
+_BASELINES = {
+    "heuristic": "avp_habitat.baselines.reactive:HeuristicPolicy",
+    "random": "avp_habitat.baselines.reactive:RandomPolicy",
+    "spin": "avp_habitat.baselines.spin:SpinPolicy",
+    "frontier": "avp_habitat.baselines.frontier:FrontierPolicy",
+    "greedy": "avp_habitat.baselines.greedy:GreedyPolicy",
 }
 POLICY_NAMES = tuple(_BASELINES)
 
@@ -59,7 +62,8 @@ def make_policy(policy: str, env: AVPEnv, seed: int) -> Policy:
     """
     check_policy(policy)
     if policy in _BASELINES:
-        return _BASELINES[policy](env, seed)
+        module, _, name = _BASELINES[policy].partition(":")
+        return getattr(importlib.import_module(module), name).for_env(env, seed)
     return _load_model(Path(policy), env, seed)
 
 

@@ -19,6 +19,11 @@ class RandomPolicy:
         """Start a random generator of its own."""
         self._rng = np.random.default_rng(seed)
 
+    @classmethod
+    def for_env(cls, env: Any, seed: int | None = None) -> "RandomPolicy":
+        """The random policy, which asks nothing of the environment."""
+        return cls(seed)
+
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.int64], Any]:
