@@ -117,7 +117,8 @@ def _shortest_cycle(simulators: list[Simulator]) -> list[Simulator]:
 
 def _take_over_monitors(venv: DummyVecEnv) -> str | None:
     """The folder of the environments' monitor files, which hold a header only and are removed; None without them."""
-    writers = [writer for writer in venv.get_attr("results_writer") if writer is not None]
+    found = venv.get_attr("results_writer") if venv.has_attr("results_writer") else []
+    writers = [writer for writer in found if writer is not None]
     files = [Path(writer.file_handler.name) for writer in writers]
     for writer, file in zip(writers, files, strict=True):
         writer.close()
