@@ -10,6 +10,9 @@ from avp_habitat.navigation.area import NavigableArea
 TILE = 16
 """Lattice points along a tile's side; a tile is the piece that is computed and kept at a time."""
 
+MARGIN_M = 0.08
+"""Less than an agent's radius: a camera this far outside of the area is still before the wall."""
+
 
 @dataclass(frozen=True)
 class Lattice:
@@ -44,9 +47,16 @@ class Lattice:
         return low.astype(np.int64)[:, None] + corner, weight
 
     def feet(self, points: NDArray[np.integer]) -> NDArray[np.float64]:
-        """`(k, 3)` where an agent stands for `(k, 2)` lattice points, metres: there, or at the area's nearest place."""
+        """`(k, 3)` where a camera's agent stands for `(k, 2)` lattice points, metres.
+
+        A point outside of the area keeps its place as far as `MARGIN_M` from it, so that an agent at a wall lies
+        between the places of its lattice points; farther ones are drawn back to that distance, before the wall.
+        """
         plane = self.area.origin + self.spacing_m * np.asarray(points)
-        place = self.area.nearest(np.stack([plane[:, 0], np.zeros(len(plane)), plane[:, 1]], axis=1))
+        wanted = np.stack([plane[:, 0], np.zeros(len(plane)), plane[:, 1]], axis=1)
+        inside = self.area.nearest(wanted)
+        out = np.linalg.norm(wanted - inside, axis=1, keepdims=True)
+        place = inside + (wanted - inside) * np.minimum(1.0, MARGIN_M / np.maximum(out, 1e-9))
         place[:, 1] = self.area.floor_height(place)
         return place
 
