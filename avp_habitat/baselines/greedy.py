@@ -39,7 +39,11 @@ def expected_cells(known: KnownMap, misses: NDArray[np.uint8]) -> NDArray[np.boo
 
     free = (known.state == FREE) & (misses < TRIES)
     unknown = (known.state == UNKNOWN) & (misses < UNKNOWN_TRIES)
-    return binary_dilation(free, mask=free | unknown, iterations=round(BEYOND_M / known.cell_m)) if free.any() else free
+    if not free.any():
+        return free
+    return np.asarray(
+        binary_dilation(free, mask=free | unknown, iterations=round(BEYOND_M / known.cell_m)), dtype=np.bool_
+    )
 
 
 class GreedyPlanner:

@@ -40,7 +40,7 @@ class KnownMap:
         return (np.asarray(point)[[2, 0]] - self.corner) / self.cell_m
 
 
-def known_map(view: AgentView, stood: NDArray[np.floating]) -> KnownMap:
+def known_map(view: AgentView, stood: NDArray[np.float64]) -> KnownMap:
     """What an agent knows about the floor.
 
     An observed cell is navigable, and the depth image around its floor point shows which of its 8 neighbours are;
