@@ -1,21 +1,24 @@
-"""The batched environment and the callbacks for Stable-Baselines3, imported when they are first named."""
+"""The batched environment, callbacks and evaluation for Stable-Baselines3, imported when they are first named."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from avp_sb3.evaluation import PolicyResult, evaluate_policy
     from avp_sb3.metrics_callback import MetricsCallback
     from avp_sb3.mlflow_callback import MLflowCallback
     from avp_sb3.rerun_callback import RerunCallback
     from avp_sb3.vec_env import AVPVecEnv
 
-__all__ = ["AVPVecEnv", "MLflowCallback", "MetricsCallback", "RerunCallback"]
+__all__ = ["AVPVecEnv", "MLflowCallback", "MetricsCallback", "PolicyResult", "RerunCallback", "evaluate_policy"]
 
 _HOME = {
     "AVPVecEnv": "avp_sb3.vec_env",
     "MetricsCallback": "avp_sb3.metrics_callback",
     "MLflowCallback": "avp_sb3.mlflow_callback",
     "RerunCallback": "avp_sb3.rerun_callback",
+    "PolicyResult": "avp_sb3.evaluation",
+    "evaluate_policy": "avp_sb3.evaluation",
 }
 
 

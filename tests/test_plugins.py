@@ -36,3 +36,13 @@ def test_every_plug_of_the_manifest_can_be_loaded(plugin):
     module, name = plugin["object"].split(":")
     assert getattr(import_module(module), name) is not None
     assert plugin["shows"]
+
+
+def test_the_zoo_finds_each_name_of_the_manifest_in_the_hyper_parameters():
+    from avp_sb3.hyperparams import hyperparams
+
+    named = {p["name"] for p in PLUGINS if p["group"] == "vec_env_wrapper"}
+    assert {values["vec_env_wrapper"] for values in hyperparams.values()} == named
+    assert set(hyperparams) == {p["name"] for p in PLUGINS if p["group"] == "registration on import"}
+    callbacks = {p["object"].replace(":", ".") for p in PLUGINS if p["group"] == "callback"}
+    assert {name for values in hyperparams.values() for name in values["callback"]} <= callbacks
