@@ -2,7 +2,8 @@
 
 The three rewards share these values; choose one by `--env-kwargs reward:"'coverage'"`. rl_zoo3 sets the device by
 `--device cpu`. PPO's buffer is `n_envs` times `n_steps`: change both together, for example `-params n_envs:4
-n_steps:512`. Several rooms: `-params vec_env_wrapper:"{'avp_sb3.zoo.Batched': {'scenes': ['builtin:1', 'builtin:2']}}"`.
+n_steps:512`. To train in several rooms:
+`-params vec_env_wrapper:"{'avp_sb3.zoo.Batched': {'scenes': ['builtin:1', 'builtin:2']}}"`.
 """
 
 from typing import Any
