@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from avp_habitat.agent_view import AgentView
 from avp_habitat.errors import UsageError, unknown_name
-from avp_habitat.observation import observation_bounds
 from avp_habitat.poses import Intrinsics
 from avp_habitat.settings import ACTION_NAMES, TaskSettings
 from avp_habitat.simulators import Frames, Simulator, make_simulator
+from avp_habitat.spaces import action_space, observation_space
 from avp_habitat.task import StepOutcome, ViewpointTask, episode_metrics
 
 RENDER_MODES = ("rgb_array",)
@@ -57,8 +57,8 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         self.settings = _with_overrides(settings or TaskSettings(), overrides)
         self.simulator = make_simulator(simulator, scene) if isinstance(simulator, str) else simulator
         self.render_mode = render_mode
-        self.observation_space = gymnasium.spaces.Box(*observation_bounds(self.settings.observation), dtype=np.float32)
-        self.action_space = gymnasium.spaces.Discrete(len(ACTION_NAMES))
+        self.observation_space = observation_space(self.settings.observation)
+        self.action_space = action_space()
         self.area = self.simulator.area
         self._task = ViewpointTask(self.simulator, self.settings, agents=1)
         self._running = False

@@ -24,22 +24,6 @@ LOW = np.array([0, -1, -1, -1, -1, -1, -1, 0, 0, 0, 0, 0], dtype=np.float32)
 HIGH = np.ones(12, dtype=np.float32)
 
 
-def observation_bounds(kind: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Least and greatest values of an observation.
-
-    Args:
-        kind: one of `settings.OBSERVATION_NAMES`.
-
-    Returns:
-        `(12,)` each for `numbers`, `(12 + map_observation.SIZE,)` each for `map`.
-    """
-    if kind == "numbers":
-        return LOW, HIGH
-    from avp_habitat.map_observation import SIZE
-
-    return np.concatenate([LOW, np.zeros(SIZE, np.float32)]), np.concatenate([HIGH, np.ones(SIZE, np.float32)])
-
-
 def depth_statistics(depth: Float, max_range_m: float) -> tuple[Float, Float]:
     """Least and mean depth as shares of the range, `(n,)` each, clipped to [0, 1].
 

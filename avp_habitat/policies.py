@@ -29,6 +29,7 @@ _BASELINES = {
     "spin": "avp_habitat.baselines.spin:SpinPolicy",
     "frontier": "avp_habitat.baselines.frontier:FrontierPolicy",
     "greedy": "avp_habitat.baselines.greedy:GreedyPolicy",
+    "oracle": "avp_habitat.oracle.policy:OraclePolicy",
 }
 POLICY_NAMES = tuple(_BASELINES)
 

@@ -11,10 +11,10 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from avp_habitat.env import step_info
 from avp_habitat.errors import UsageError
-from avp_habitat.observation import observation_bounds
 from avp_habitat.poses import Intrinsics
-from avp_habitat.settings import ACTION_NAMES, TaskSettings
+from avp_habitat.settings import TaskSettings
 from avp_habitat.simulators import Frames, Simulator, make_simulator
+from avp_habitat.spaces import action_space, observation_space
 from avp_habitat.task import ViewpointTask
 
 
@@ -55,8 +55,8 @@ class AVPVecEnv(VecEnv):
         self.render_mode = None
         super().__init__(
             agents,
-            gymnasium.spaces.Box(*observation_bounds(self.settings.observation), dtype=np.float32),
-            gymnasium.spaces.Discrete(len(ACTION_NAMES)),
+            observation_space(self.settings.observation),
+            action_space(),
         )
         self._task = ViewpointTask(self.simulators, self.settings, agents)
         self._generators = [np.random.default_rng() for _ in range(agents)]

@@ -40,7 +40,7 @@ class TileFiles:
         if self._folder is None:
             return None
         try:
-            with np.load(self._path(self._folder, tile), allow_pickle=False) as file:
+            with np.load(self._path(self._folder, tile)) as file:
                 found, visible, statistics = file["points"], file["visible"], file["statistics"]
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return None

@@ -1,0 +1,29 @@
+"""The spaces of `AVP-v0` as gymnasium describes them."""
+
+import gymnasium
+import numpy as np
+
+from avp_habitat.map_observation import SIZE
+from avp_habitat.observation import HIGH, LOW
+from avp_habitat.settings import ACTION_NAMES
+
+
+def observation_space(kind: str) -> gymnasium.spaces.Box:
+    """Observations of a kind.
+
+    Args:
+        kind: one of `settings.OBSERVATION_NAMES`.
+
+    Returns:
+        `(12,)` for `numbers`, `(12 + map_observation.SIZE,)` for `map`, float32.
+    """
+    low, high = LOW, HIGH
+    if kind == "map":
+        low = np.concatenate([LOW, np.zeros(SIZE, np.float32)])
+        high = np.concatenate([HIGH, np.ones(SIZE, np.float32)])
+    return gymnasium.spaces.Box(low, high, dtype=np.float32)
+
+
+def action_space() -> gymnasium.spaces.Discrete:
+    """The six actions, numbered as in `settings.ACTION_NAMES`."""
+    return gymnasium.spaces.Discrete(len(ACTION_NAMES))
