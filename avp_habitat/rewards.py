@@ -20,33 +20,33 @@ PARTS = ("coverage", "spread", "step", "collision", "redundancy", "stop")
 class RewardConstants:
     """The constants of all rewards; the paper gives none, so these are ours and the same for every scene."""
 
-    alpha: float = 0.02
+    alpha: float = 0.004
     """α of `coverage` and `coverage_redundancy`: reward per newly observed cell (0.01 m²)."""
-    alpha_proposed: float = 0.1
+    alpha_proposed: float = 0.005
     """α of `proposed`: reward per (newly observed cell)^β."""
-    beta: float = 0.5
+    beta: float = 0.9
     """β of `proposed`, no unit, below 1: many new cells at once count less than the same cells one after another."""
     visit_decay: float = 0.5
     """Weight of earlier visits v in α / (1 + 0.5·v), per visit."""
-    spread: float = 0.02
+    spread: float = 0.002
     """λ_s: reward per metre between the agent and the mean of the positions it visited."""
     spread_limit_m: float = 3.0
     """r_max in metres: more distance than this earns nothing more."""
-    step: float = 0.05
+    step: float = 0.025
     """P_step: cost of each step."""
-    collision: float = 0.2
+    collision: float = 0.05
     """P_collision: cost of a forward move that was blocked."""
-    redundancy: float = 0.1
+    redundancy: float = 0.03
     """P_redundancy: cost of a view like an earlier one."""
     redundancy_distance_m: float = 0.2
     """d_red in metres: below one forward move, so that walking on is never redundant."""
     redundancy_angle_deg: float = 5.0
     """δ in degrees, for yaw and pitch alike: below one turn, so that turning on is never redundant."""
-    stop_bonus: float = 2.0
+    stop_bonus: float = 2.5
     """B_s: reward of stopping with enough coverage."""
     stop_per_step_left: float = 0.05
     """λ_e: further reward per step of the budget that was not used."""
-    early_stop: float = 0.2
+    early_stop: float = 0.02
     """Cost of choosing stop with too little coverage."""
     stop_coverage: float = 0.85
     """τ: the coverage from which stop ends the episode, within [0, 1]."""

@@ -8,27 +8,15 @@ n_steps:512`. To train in several rooms:
 
 from typing import Any
 
-BUFFER = 2048
-"""Steps of all agents between two updates."""
-AGENTS = 16
-"""Agents stepped as one batch; they share the buffer."""
+from avp_sb3.presets import TABLE_4
 
-_TABLE_4: dict[str, Any] = {
+_COMMON: dict[str, Any] = {
     "n_timesteps": 300_000,
     "policy": "MlpPolicy",
-    "learning_rate": 3e-4,
-    "ent_coef": 0.02,
-    "clip_range": 0.2,
-    "n_envs": AGENTS,
-    "n_steps": BUFFER // AGENTS,
-    "n_epochs": 10,
-    "batch_size": 512,
-    "gae_lambda": 0.95,
-    "gamma": 0.99,
     "vec_env_wrapper": "avp_sb3.zoo.Batched",
     # When a training is interrupted rl_zoo3 ends the first callback only: the MLflow run is the one to close.
     "callback": ["avp_sb3.MLflowCallback", "avp_sb3.MetricsCallback"],
 }
 
-hyperparams: dict[str, dict[str, Any]] = {"AVP-v0": _TABLE_4}
+hyperparams: dict[str, dict[str, Any]] = {"AVP-v0": TABLE_4.zoo() | _COMMON}
 """By environment, the form in which rl_zoo3 reads it."""

@@ -1,77 +1,109 @@
-"""Train a viewpoint policy with Stable-Baselines3's PPO and the suite's callbacks (Table 4's values)."""
+"""Train a viewpoint policy with Stable-Baselines3's PPO and the suite's callbacks."""
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from avp_habitat import command
-from avp_habitat.errors import UsageError
-from avp_habitat.settings import TaskSettings
-
-_BUFFER = 2048
+from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.settings import OBSERVATION_NAMES, TaskSettings
+from avp_sb3.presets import PRESETS, Preset
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     add = parser.add_argument
-    add("--scene", default="builtin:0", help="a mesh (.glb .gltf .ply .obj), or builtin:SEED")
+    add("--scene", default=["builtin:0"], nargs="+", help="meshes (.glb .gltf .ply .obj) or builtin:SEED; agents share")
     add("--reward", default="proposed", help="coverage, coverage_redundancy or proposed")
-    add("--steps", default=300_000, type=int, help="environment steps")
-    add("--agents", default=16, type=int, help="agents stepped as one batch")
+    add("--observation", default="numbers", help="numbers (the paper's twelve) or map; also chooses PPO's settings")
+    add("--steps", default=300_000, type=int, help="environment steps in total")
+    add("--agents", default=None, type=int, help="agents stepped as one batch; the settings' own when omitted")
+    add("--rays", action="store_true", help="cast all rays instead of looking views up in the scenes' tables")
     add("--width", default=160, type=int, help="of the policy's depth image in pixels")
     add("--height", default=120, type=int, help="of the policy's depth image in pixels")
     add("--seed", default=0, type=int, help="of the policy and the starts")
     add("--out", default=Path("runs/ppo.zip"), type=Path, help="the model; also written after Ctrl-C")
+    add("--resume", default=None, type=Path, metavar="MODEL.zip", help="go on with a model until --steps are done")
     add("--recording", default=None, type=Path, help="the Rerun recording (.rrd) of some episodes; none when omitted")
+    add("--experiment", default="avp", help="of MLflow")
     add("--run-name", default=None, help="of the MLflow run")
     return parser
+
+
+def _preset(options: argparse.Namespace) -> Preset:
+    """PPO's settings; the buffer is shared by as many agents as asked for."""
+    if options.observation not in OBSERVATION_NAMES:
+        raise unknown_name("observation", options.observation, OBSERVATION_NAMES)
+    if options.steps < 1:
+        raise UsageError(f"--steps: expected at least 1, got {options.steps}")
+    preset = PRESETS[options.observation]
+    buffer = preset.n_envs * preset.n_steps
+    agents = preset.n_envs if options.agents is None else options.agents
+    if agents < 1 or buffer % agents:
+        raise UsageError(f"--agents: expected a divisor of PPO's buffer of {buffer} steps, got {agents}")
+    return replace(preset, n_envs=agents, n_steps=buffer // agents)
+
+
+def _model(options: argparse.Namespace, preset: Preset, env: Any) -> Any:
+    from stable_baselines3 import PPO
+
+    if options.resume is None:
+        return PPO("MlpPolicy", env, device="cpu", seed=options.seed, **preset.arguments())
+    if not options.resume.is_file():
+        raise UsageError(f"--resume {options.resume}: no such model file")
+    try:
+        model = PPO.load(options.resume, env=env, device="cpu")
+    except ValueError as error:
+        raise UsageError(f"--resume {options.resume}: does not fit these options: {error}") from None
+    if model.num_timesteps >= options.steps:
+        raise UsageError(f"--steps: {options.resume} has {model.num_timesteps} already; expected more")
+    return model
 
 
 def main(argv: Sequence[str]) -> None:
     """Train, track and save."""
     options = _parser().parse_args(argv)
-    if options.agents < 1 or _BUFFER % options.agents:
-        raise UsageError(f"--agents: expected a divisor of PPO's buffer of {_BUFFER} steps, got {options.agents}")
-    if options.steps < 1:
-        raise UsageError(f"--steps: expected at least 1, got {options.steps}")
-    settings = TaskSettings(reward=options.reward, width=options.width, height=options.height)
+    preset = _preset(options)
+    settings = TaskSettings(
+        reward=options.reward,
+        observation=options.observation,
+        lookup=not options.rays,
+        width=options.width,
+        height=options.height,
+    )
 
     # Late, so that --help and a mistyped option answer at once.
     import torch
-    from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecMonitor
 
     from avp_sb3 import AVPVecEnv, MetricsCallback, MLflowCallback, RerunCallback
 
-    # The policy is a small network: one thread of torch leaves the other core to the rays.
+    # The policy is a small network: more threads of torch only wait for each other.
     torch.set_num_threads(1)
-    env = VecMonitor(AVPVecEnv(options.scene, agents=options.agents, settings=settings, seed=options.seed))
-    model = PPO(
-        "MlpPolicy",
-        env,
-        learning_rate=3e-4,
-        ent_coef=0.02,
-        clip_range=0.2,
-        n_steps=_BUFFER // options.agents,
-        n_epochs=10,
-        batch_size=512,
-        gae_lambda=0.95,
-        gamma=0.99,
-        device="cpu",
-        seed=options.seed,
-    )
-    tracking = MLflowCallback(run_name=options.run_name)
+    env = VecMonitor(AVPVecEnv(options.scene, agents=preset.n_envs, settings=settings, seed=options.seed))
+    model = _model(options, preset, env)
+    tracking = MLflowCallback(options.experiment, run_name=options.run_name)
     callbacks = [MetricsCallback(), tracking]
     if options.recording is not None:
         callbacks.append(RerunCallback(options.recording))
     options.out.parent.mkdir(parents=True, exist_ok=True)
+    done = False
     try:
         with tracking:
-            model.learn(options.steps, callback=callbacks, progress_bar=True)
+            # With reset_num_timesteps=False, SB3 counts the steps from where the model stands.
+            left = options.steps - model.num_timesteps
+            model.learn(left, callback=callbacks, progress_bar=True, reset_num_timesteps=options.resume is None)
+        done = True
     finally:
         model.save(options.out)
         print(f"{options.out}: the policy after {model.num_timesteps} steps; MLflow run {tracking.run_id}")
+        if not done:
+            again = shlex.join(["python", "examples/train.py", *argv, "--resume", str(options.out)])
+            print(f"to go on:  {again}")
 
 
 if __name__ == "__main__":

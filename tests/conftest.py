@@ -19,3 +19,9 @@ def shared() -> Path:
 def quiet_threads() -> None:
     """Subprocesses of tests share two cores with the tests."""
     os.environ.setdefault("OMP_NUM_THREADS", "2")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Tables of scenes that tests make do not fill the user's cache."""
+    os.environ["AVP_CACHE"] = str(tmp_path_factory.mktemp("cache"))

@@ -3,6 +3,8 @@
 import numpy as np
 from numba import njit
 
+ONE = np.uint64(1)
+
 
 @njit(cache=True)
 def depth_statistics(statistics, slots, weights, yaw, pitch, least, mean):
@@ -20,17 +22,17 @@ def depth_statistics(statistics, slots, weights, yaw, pitch, least, mean):
     yaws, pitches = statistics.shape[1:3]
     for k in range(len(slots)):
         y0 = int(np.floor(yaw[k]))
-        p0 = min(max(int(np.floor(pitch[k])), 0), pitches - 2) if pitches > 1 else 0
+        # The last pitch lies on the table's border: the entry beyond it has no weight and is not read.
+        p0 = min(max(int(np.floor(pitch[k])), 0), max(pitches - 2, 0))
         wy, wp = yaw[k] - y0, pitch[k] - p0
         low, average = 0.0, 0.0
-        for corner in range(4):
-            for turn in range(2):
-                for tilt in range(2):
-                    share = weights[k, corner] * (wy if turn else 1 - wy) * (wp if tilt else 1 - wp)
-                    if share != 0:
-                        entry = statistics[slots[k, corner], (y0 + turn) % yaws, p0 + tilt]
-                        low += share * entry[0]
-                        average += share * entry[1]
+        for entry in range(16):
+            corner, turn, tilt = entry // 4, entry // 2 % 2, entry % 2
+            share = weights[k, corner] * (wy if turn else 1 - wy) * (wp if tilt else 1 - wp)
+            if share != 0:
+                at = statistics[slots[k, corner], (y0 + turn) % yaws, p0 + tilt]
+                low += share * at[0]
+                average += share * at[1]
         least[k], mean[k] = low / 65535, average / 65535
 
 
@@ -55,40 +57,37 @@ def new_cells(visible, slots, pose, centres, camera, max_range, rows, steps, fir
         How many pairs are doubtful; beyond c they are counted but not written.
     """
     doubts = 0
-    width, height, fx, fy, cx, cy = camera
     for k in range(len(slots)):
         a, b, c, d = visible[slots[k, 0]], visible[slots[k, 1]], visible[slots[k, 2]], visible[slots[k, 3]]
         seen = first_seen[rows[k]]
-        turned = pose[k]
-        x0, y0, z0 = turned[0, 3], turned[1, 3], turned[2, 3]
         count = 0
         for word in range(visible.shape[1]):
             some = a[word] | b[word] | c[word] | d[word]
-            if some == 0:
-                continue
             every = a[word] & b[word] & c[word] & d[word]
-            for bit in range(64):
-                mark = np.uint64(1) << np.uint64(bit)
-                if some & mark == 0:
-                    continue
-                cell = word * 64 + bit
-                if seen[cell] != 0:
-                    continue
-                x, y, z = centres[cell, 0] - x0, centres[cell, 1] - y0, centres[cell, 2] - z0
-                depth = -(turned[0, 2] * x + turned[1, 2] * y + turned[2, 2] * z)
-                if depth <= 0 or x * x + y * y + z * z > max_range * max_range:
-                    continue
-                depth = max(depth, 1e-9)
-                u = fx * (turned[0, 0] * x + turned[1, 0] * y + turned[2, 0] * z) / depth + cx
-                v = -fy * (turned[0, 1] * x + turned[1, 1] * y + turned[2, 1] * z) / depth + cy
-                if u < 0 or v < 0 or u >= width or v >= height:
-                    continue
-                if every & mark != 0:
-                    seen[cell] = steps[k]
-                    count += 1
-                else:
-                    if doubts < len(doubtful):
-                        doubtful[doubts, 0], doubtful[doubts, 1] = k, cell
-                    doubts += 1
+            cell = 64 * word
+            while some != 0:
+                if some & ONE and seen[cell] == 0 and _in_view(pose[k], centres[cell], camera, max_range):
+                    if every & ONE:
+                        seen[cell] = steps[k]
+                        count += 1
+                    else:
+                        if doubts < len(doubtful):
+                            doubtful[doubts, 0], doubtful[doubts, 1] = k, cell
+                        doubts += 1
+                some, every, cell = some >> ONE, every >> ONE, cell + 1
         found[k] = count
     return doubts
+
+
+@njit(cache=True)
+def _in_view(pose, point, camera, max_range):
+    """Whether a point lies inside the image and within range; the rule of `coverage.candidates`."""
+    width, height, fx, fy, cx, cy = camera
+    x, y, z = point[0] - pose[0, 3], point[1] - pose[1, 3], point[2] - pose[2, 3]
+    depth = -(pose[0, 2] * x + pose[1, 2] * y + pose[2, 2] * z)
+    if depth <= 0 or x * x + y * y + z * z > max_range * max_range:
+        return False
+    depth = max(depth, 1e-9)
+    u = fx * (pose[0, 0] * x + pose[1, 0] * y + pose[2, 0] * z) / depth + cx
+    v = -fy * (pose[0, 1] * x + pose[1, 1] * y + pose[2, 1] * z) / depth + cy
+    return 0 <= u < width and 0 <= v < height

@@ -1,0 +1,158 @@
+"""Search the rewards' constants: train with random ones, score the policies, log every trial to MLflow."""
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from avp_habitat import command
+from avp_habitat.rewards import RewardConstants
+from avp_habitat.settings import TaskSettings
+
+EXPERIMENT = "avp-reward-search"
+VIEWS_WEIGHT = 0.3
+"""Worth of the whole budget of views beside the whole floor: one view fewer is worth 0.375 percentage points."""
+_RANGES = {
+    "alpha_proposed": (0.001, 0.02),
+    "stop_bonus": (0.5, 5.0),
+    "stop_per_step_left": (0.01, 0.1),
+    "step": (0.005, 0.05),
+    "spread": (0.0003, 0.01),
+    "redundancy": (0.005, 0.1),
+    "early_stop": (0.003, 0.05),
+    "collision": (0.02, 0.2),
+}
+"""Drawn log-uniformly; β is drawn uniformly within (0.7, 0.95)."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One training with its own constants."""
+
+    number: int
+    """From 0; number 0 uses the constants as they are."""
+    constants: RewardConstants
+    """Of the rewards."""
+    scenes: tuple[str, ...]
+    """Where the policy is trained and scored."""
+    steps: int
+    """Environment steps."""
+    seed: int
+    """Of the policy and the starts."""
+
+
+def draw_constants(number: int, seed: int) -> RewardConstants:
+    """The constants of a trial; number 0 is what the project uses now."""
+    if number == 0:
+        return RewardConstants()
+    rng = np.random.default_rng([seed, number])
+    drawn = {name: float(np.exp(rng.uniform(np.log(low), np.log(high)))) for name, (low, high) in _RANGES.items()}
+    drawn["beta"] = float(rng.uniform(0.7, 0.95))
+    return replace(RewardConstants(), **{name: float(f"{value:.3g}") for name, value in drawn.items()})
+
+
+def score(coverage: float, views: float, budget: int) -> float:
+    """What a policy is worth: its coverage, less the share of the budget that it used (episodes without stop use all).
+
+    Args:
+        coverage: mean final coverage within [0, 1].
+        views: mean views.
+        budget: T.
+    """
+    return coverage - VIEWS_WEIGHT * views / budget
+
+
+def run_trial(trial: Trial) -> dict[str, Any]:
+    """Train, score and log one trial; gives its constants and figures."""
+    # Late: each process of the pool loads these once, with one thread.
+    import torch
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecMonitor
+
+    from avp_sb3 import AVPVecEnv, MetricsCallback, MLflowCallback
+    from avp_sb3.presets import MAP
+
+    torch.set_num_threads(1)
+    settings = TaskSettings(reward="proposed", observation="map", lookup=True, constants=trial.constants)
+    env = VecMonitor(AVPVecEnv(trial.scenes, agents=MAP.n_envs, settings=settings, seed=trial.seed))
+    model = PPO("MlpPolicy", env, device="cpu", seed=trial.seed, **MAP.arguments())
+    tags = {"trial": str(trial.number)}
+    with MLflowCallback(EXPERIMENT, run_name=f"trial-{trial.number}", log_model=False, tags=tags) as tracking:
+        model.learn(trial.steps, callback=[tracking, MetricsCallback()])
+    figures = _evaluate(model, trial.scenes, settings)
+    figures["score"] = score(figures["coverage"], figures["views"], settings.budget)
+    _log(tracking.run_id, figures)
+    return {"trial": trial.number, "run": tracking.run_id, **asdict(trial.constants), **figures}
+
+
+def _evaluate(model: Any, scenes: Sequence[str], settings: TaskSettings, episodes: int = 64) -> dict[str, float]:
+    """Mean figures of one sampled episode from each of 64 fixed starts."""
+    from avp_sb3 import AVPVecEnv
+
+    env = AVPVecEnv(scenes, agents=episodes, settings=settings, seed=1000)
+    observation, first = env.reset(), {}
+    for _ in range(settings.budget):
+        observation, _, done, infos = env.step(model.predict(observation, deterministic=False)[0])
+        for index in np.flatnonzero(done):
+            first.setdefault(int(index), infos[index]["avp_episode"])
+    means = {name: float(np.mean([episode[name] for episode in first.values()])) for name in first[0]}
+    return {name: means[name] for name in ("coverage", "views", "stopped", "annd_m", "collisions")}
+
+
+def _log(run: str | None, figures: dict[str, float]) -> None:
+    import mlflow
+
+    client = mlflow.MlflowClient()
+    for name, value in figures.items():
+        client.log_metric(str(run), f"search/{name}", value)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    add = parser.add_argument
+    add("--scene", nargs="+", required=True, help="meshes or builtin:SEED")
+    add("--trials", default=12, type=int, help="trainings, the first with the constants in use")
+    add("--steps", default=400_000, type=int, help="environment steps of each")
+    add("--jobs", default=2, type=int, help="trainings at a time")
+    add("--seed", default=0, type=int, help="of the draws, the policies and the starts")
+    add("--out", default=Path("runs/reward-search.json"), type=Path, help="all trials, the best first")
+    return parser
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run the trials; print and write them, the best first. After Ctrl-C those that are done are kept."""
+    options = _parser().parse_args(argv)
+    os.environ.setdefault("MLFLOW_TRACKING_URI", "sqlite:///mlflow.db")
+    os.environ["OMP_NUM_THREADS"] = "1"
+    trials = [
+        Trial(number, draw_constants(number, options.seed), tuple(options.scene), options.steps, options.seed)
+        for number in range(options.trials)
+    ]
+    # Made before the processes start: two that make one sqlite file's tables at a time get in each other's way.
+    import mlflow
+
+    if mlflow.get_experiment_by_name(EXPERIMENT) is None:
+        mlflow.create_experiment(EXPERIMENT)
+    done: list[dict[str, Any]] = []
+    # Forked processes would share MLflow's and Open3D's threads.
+    with multiprocessing.get_context("spawn").Pool(options.jobs) as pool, tqdm(total=len(trials), unit="trial") as bar:
+        for result in pool.imap_unordered(run_trial, trials):
+            done.append(result)
+            bar.update()
+            bar.write(f"trial {result['trial']}: " + ", ".join(f"{k} {result[k]:.3f}" for k in list(result)[-6:]))
+            done.sort(key=lambda trial: -trial["score"])
+            options.out.parent.mkdir(parents=True, exist_ok=True)
+            options.out.write_text(json.dumps({"command": sys.argv, "trials": done}, indent=1) + "\n")
+    print(f"{options.out}: {len(done)} trials; best {done[0]['trial']}")
+
+
+if __name__ == "__main__":
+    sys.exit(command.run(main))
