@@ -4,6 +4,7 @@ import logging
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 from mlflow import MlflowClient
@@ -35,8 +36,8 @@ class Way:
     """Whether it is one `AVPVecEnv`."""
     lookup: bool
     """Whether views are looked up in tables."""
-    callbacks: bool
-    """Whether metrics, MLflow and Rerun record the training."""
+    callbacks: Literal["none", "tracking", "all"]
+    """none. tracking: metrics and MLflow. all: also Rerun with its defaults, which renders pictures."""
 
 
 @dataclass(frozen=True)
@@ -110,9 +111,10 @@ def train(way: Way, simulator: Simulator, *, reward: str, steps: int, seed: int,
     clock = Clock()
     recording = folder / "training.rrd"
     callbacks: list[BaseCallback] = [clock]
-    if way.callbacks:
-        mlflow = MLflowCallback(_EXPERIMENT, tracking_uri=tracking)
-        callbacks += [MetricsCallback(), mlflow, RerunCallback(recording)]
+    if way.callbacks != "none":
+        callbacks += [MetricsCallback(), MLflowCallback(_EXPERIMENT, tracking_uri=tracking)]
+    if way.callbacks == "all":
+        callbacks.append(RerunCallback(recording))
     start = time.perf_counter()
     try:
         model.learn(steps, callback=callbacks)

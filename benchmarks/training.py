@@ -1,6 +1,6 @@
-"""Steps/s of PPO training (Table 4's values) in four ways, its peak memory and its start-up time.
+"""Steps/s of PPO training (Table 4's values) in five ways, its peak memory and its start-up time.
 
-The ways take turns, A B C D A B C D …, with the same seed in a turn, so that their ratios are paired; one training
+The ways take turns, A B C D E A B …, with the same seed in a turn, so that their ratios are paired; one training
 before the first turn is not measured, because a process imports and compiles much when it trains first. `steps_per_s`
 counts from the first step to the end of the last update; the whole `learn()`, with the opening and closing of the
 MLflow run and the Rerun file, is given beside it. Memory and start-up are measured in fresh processes, with tables in
@@ -31,7 +31,9 @@ from avp_sb3.presets import TABLE_4
 
 _BUFFER = TABLE_4.n_envs * TABLE_4.n_steps
 _WHOLE_TRAINING = 300_000
-_FAST, _BARE, _CAST, _SINGLE = "tables, callbacks", "tables", "rays", "single, rays, callbacks"
+_FAST, _TRACKED, _BARE = "tables, all callbacks", "tables, metrics + MLflow", "tables"
+_CAST, _SINGLE = "rays", "single, rays, all callbacks"
+_WAYS = 5
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -40,8 +42,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--scene", default="builtin:0", help="a mesh (.glb .gltf .ply .obj), or builtin:SEED")
     add("--reward", default="proposed", help="the reward's name")
     add("--agents", default=TABLE_4.n_envs, type=int, help="of the batched ways; divides PPO's buffer of 2048 steps")
-    add("--repeats", default=3, type=int, help="turns of the four ways")
-    add("--steps", default=40_960, type=int, help="of the ways with tables; PPO completes its buffer of 2048")
+    add("--repeats", default=3, type=int, help="turns of the five ways")
+    add("--steps", default=61_440, type=int, help="of the ways with tables; PPO completes its buffer of 2048")
     add("--cast-steps", default=6144, type=int, help="of the way that casts all rays")
     add("--single-steps", default=2048, type=int, help="of the single environment")
     add("--raw-seconds", default=1.5, type=float, help="of casting rays alone, in each turn")
@@ -62,7 +64,7 @@ def main(argv: Sequence[str]) -> None:
     with tempfile.TemporaryDirectory() as name, reporting.reported("training", options) as results:
         folder = Path(name)
         with _cache(folder / "tables"):
-            for _ in tqdm(_trainings(options, folder, results), total=4 * options.repeats, desc="trainings"):
+            for _ in tqdm(_trainings(options, folder, results), total=_WAYS * options.repeats, desc="trainings"):
                 pass
             _processes(options, folder, results)
 
@@ -96,10 +98,11 @@ def _trainings(options: argparse.Namespace, folder: Path, results: reporting.Res
     build_s = time.perf_counter() - start
     tracking = ppo.prepare_tracking(folder)
     ways = {
-        ppo.Way(_FAST, options.agents, batched=True, lookup=True, callbacks=True): options.steps,
-        ppo.Way(_BARE, options.agents, batched=True, lookup=True, callbacks=False): options.steps,
-        ppo.Way(_CAST, options.agents, batched=True, lookup=False, callbacks=True): options.cast_steps,
-        ppo.Way(_SINGLE, 1, batched=False, lookup=False, callbacks=True): options.single_steps,
+        ppo.Way(_FAST, options.agents, batched=True, lookup=True, callbacks="all"): options.steps,
+        ppo.Way(_TRACKED, options.agents, batched=True, lookup=True, callbacks="tracking"): options.steps,
+        ppo.Way(_BARE, options.agents, batched=True, lookup=True, callbacks="none"): options.steps,
+        ppo.Way(_CAST, options.agents, batched=True, lookup=False, callbacks="none"): options.cast_steps,
+        ppo.Way(_SINGLE, 1, batched=False, lookup=False, callbacks="all"): options.single_steps,
     }
     timings: dict[str, list[ppo.Timing]] = {way.name: [] for way in ways}
     rays_per_step: list[float] = []
@@ -168,13 +171,14 @@ def _comparison(
 
     shares = [rate * rays / raw for rate, rays, raw in zip(rates[_FAST], rays_per_step, raw_rates, strict=False)]
     return [
-        *row("callbacks cost, % of steps/s", [100 * (1 - ratio) for ratio in paired(_FAST, _BARE)]),
-        *row("tables over rays, x", paired(_FAST, _CAST)),
-        *row("batched with tables over single, x", paired(_FAST, _SINGLE)),
+        *row("metrics + MLflow cost, % of steps/s", [100 * (1 - ratio) for ratio in paired(_TRACKED, _BARE)]),
+        *row("all callbacks cost, % of steps/s", [100 * (1 - ratio) for ratio in paired(_FAST, _BARE)]),
+        *row("tables over rays, both without callbacks, x", paired(_BARE, _CAST)),
+        *row("tables over single, both with all callbacks, x", paired(_FAST, _SINGLE)),
         *row("rays of the definition per step", rays_per_step),
         *row("raw rays/s", raw_rates),
         *row("raw steps/s", [raw / rays for raw, rays in zip(raw_rates, rays_per_step, strict=True)]),
-        *row("share of the raw rate, tables with callbacks", shares),
+        *row("share of the raw rate, tables with all callbacks", shares),
     ]
 
 

@@ -45,7 +45,7 @@ def main(argv: Sequence[str]) -> None:
 
     with tempfile.TemporaryDirectory() as name:
         timing = ppo.train(
-            ppo.Way("", options.agents, batched=True, lookup=True, callbacks=True),
+            ppo.Way("", options.agents, batched=True, lookup=True, callbacks="all"),
             make_simulator("raycast", options.scene),
             reward=options.reward,
             steps=options.steps,

@@ -45,7 +45,7 @@ def modules(monkeypatch):
 
 
 def test_the_benchmark_of_the_environment_sets_steps_beside_their_rays(tmp_path):
-    words = ("--agents", 1, 3, "--resolutions", "16x12", "--seconds", 0.03)
+    words = ("--scene", "builtin:1", "--agents", 1, 3, "--resolutions", "16x12", "--seconds", 0.03)
     results = report(run("environment.py", *words, folder=tmp_path), tmp_path)
     assert [(row["agents"], row["lookup"], row["image"]) for row in results["environment"]] == [
         *((agents, lookup, "16x12") for agents in (1, 3) for lookup in ("off", "on")),
@@ -69,11 +69,11 @@ def test_the_benchmark_of_scenes_measures_rooms_and_halls(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_benchmark_of_training_compares_four_ways_and_measures_memory(tmp_path):
+def test_the_benchmark_of_training_compares_five_ways_and_measures_memory(tmp_path):
     words = ("--repeats", 1, "--steps", 1, "--cast-steps", 1, "--single-steps", 1, "--raw-seconds", 0.1)
     results = report(run("training.py", *words, "--memory-agents", 16, "--memory-steps", 1, folder=tmp_path), tmp_path)
     assert [row["way"] for row in results["training"]] == [
-        *("tables, callbacks", "tables", "rays", "single, rays, callbacks"),
+        *("tables, all callbacks", "tables, metrics + MLflow", "tables", "rays", "single, rays, all callbacks"),
     ]
     for row in results["training"]:
         positive(row, "steps_per_s", "s_for_300000_steps")
