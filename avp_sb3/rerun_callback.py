@@ -1,5 +1,6 @@
 """Finished episodes of a training as a Rerun recording."""
 
+import time
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,10 +28,11 @@ class RecordingError(AVPError):
 
 
 class RerunCallback(BaseCallback):
-    """Writes every k-th finished episode to one `.rrd` file per training; open it with `rerun FILE`.
+    """Writes finished episodes to one `.rrd` file per training; open it with `rerun FILE`.
 
     The pictures are rendered after the episode has ended, so steps in between cost nothing. An episode of 80 steps with
-    8 pictures of 320x240 takes about 0.3 MB; `max_bytes` bounds the whole file.
+    8 pictures of 320x240 takes about 0.3 MB and a quarter of a second; `max_bytes` bounds the whole file, `max_share`
+    the time, whatever the speed of the training.
     """
 
     def __init__(
@@ -42,17 +44,20 @@ class RerunCallback(BaseCallback):
         width: int = 320,
         height: int = 240,
         max_bytes: int = 500_000_000,
+        max_share: float = 0.01,
         verbose: int = 0,
     ) -> None:
         """Describe the recording; nothing is written before the training starts.
 
         Args:
             path: the file to make; `runs/avp-DATE-TIME.rrd` when omitted. A second `learn()` adds `-2` to the name.
-            every: record the first finished episode and each k-th after it, counted over all environments.
+            every: record the first finished episode, and the next one when k more have ended (counted over all
+                environments) and `max_share` allows it.
             pictures: RGB and depth pictures per episode at most, spread over its steps; 0 for none.
             width: of the pictures, pixels.
             height: of the pictures, pixels.
             max_bytes: no further episode is recorded once the file has this size.
+            max_share: recording may take this share of the training's time; 1 records every k-th episode.
             verbose: 1 prints where the recording is.
 
         Raises:
@@ -69,7 +74,11 @@ class RerunCallback(BaseCallback):
                 raise UsageError(f"RerunCallback {name}: expected at least {least}, got {value}")
         self.path: Path | None = None
         self._wanted_path = None if path is None else Path(path)
-        self._every, self._pictures, self._max_bytes = every, pictures, max_bytes
+        if not 0 < max_share <= 1:
+            raise UsageError(f"RerunCallback max_share: expected a number within (0, 1], got {max_share}")
+        self._every, self._pictures, self._max_bytes, self._max_share = every, pictures, max_bytes, max_share
+        self._started = self._spent = 0.0
+        self._due = 1
         self._size = (width, height)
         self._recording: rr.RecordingStream | None = None
         self._trainings = self._episodes = self._steps = 0
@@ -84,6 +93,7 @@ class RerunCallback(BaseCallback):
         self.close()
         self._trainings += 1
         self._episodes = self._steps = 0
+        self._started, self._spent, self._due = time.monotonic(), 0.0, 1
         path = self._next_path()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -97,9 +107,15 @@ class RerunCallback(BaseCallback):
     def _on_step(self) -> bool:
         for index, info in finished_episodes(self.locals):
             self._episodes += 1
-            if (self._episodes - 1) % self._every == 0 and self._has_room():
+            if self._episodes >= self._due and self._has_time() and self._has_room():
+                began = time.monotonic()
                 self._record(index, required(info, "avp_trajectory", reader="RerunCallback"))
+                self._spent += time.monotonic() - began
+                self._due = self._episodes + self._every
         return True
+
+    def _has_time(self) -> bool:
+        return self._spent <= self._max_share * (time.monotonic() - self._started)
 
     def _on_training_end(self) -> None:
         self.close()

@@ -1,5 +1,6 @@
 """Many agents in one or more scenes as one Stable-Baselines3 `VecEnv`: one task, and one call for all their views."""
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -44,7 +45,7 @@ class AVPVecEnv(VecEnv):
             seed: of the starts; agent i uses `seed + i`, as SB3 seeds separate environments.
 
         Raises:
-            UsageError: too few agents, or an unknown name.
+            UsageError: too few agents, more than memory allows, or an unknown name.
             SceneError: a scene cannot be used; the text names it.
             SimulatorError: the simulator cannot run here.
         """
@@ -52,6 +53,7 @@ class AVPVecEnv(VecEnv):
         self.simulators = _open(scene, simulator)
         if agents < len(self.simulators):
             raise UsageError(f"agents: expected at least {len(self.simulators)}, one for each scene, got {agents}")
+        _check_memory(agents, self.simulators, self.settings)
         self.render_mode = None
         super().__init__(
             agents,
@@ -140,6 +142,18 @@ _OF_AGENT = {
     "camera_to_world": lambda task, row: task.camera_to_world[row],
     "agent_view": lambda task, row: task.agent_view(row),
 }
+
+
+def _check_memory(agents: int, simulators: Sequence[Simulator], settings: TaskSettings) -> None:
+    """Refuse what would end in the middle of making it: the agents' cells, paths, logs and newest observations."""
+    cells = max(len(simulator.area.centres) for simulator in simulators)
+    numbers = int(np.prod(observation_space(settings.observation).shape))
+    needed = agents * (2 * cells + 8 * 24 * (settings.budget + 1) + 3 * 4 * numbers)
+    free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if needed > free:
+        raise UsageError(
+            f"agents: {agents} need about {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; take fewer"
+        )
 
 
 def _open(scene: str | Sequence[str], simulator: str | Simulator | Sequence[Simulator]) -> list[Simulator]:

@@ -10,7 +10,7 @@ import avp_habitat
 from avp_habitat.baselines import HeuristicPolicy, RandomPolicy
 from avp_habitat.coverage import candidates
 from avp_habitat.env import AVPEnv
-from avp_habitat.errors import UsageError
+from avp_habitat.errors import SceneError, UsageError
 from avp_habitat.heldout import heldout_poses
 from avp_habitat.poses import Intrinsics, project, unproject
 from avp_habitat.rewards import PARTS
@@ -196,6 +196,48 @@ def test_the_batched_environment_equals_separate_ones():
         assert one["TimeLimit.truncated"] == other["TimeLimit.truncated"]
     assert batched.get_attr("scene_name") == separate.get_attr("scene_name")
     np.testing.assert_allclose(batched.get_attr("centre_depth"), separate.get_attr("centre_depth"), atol=1e-4)
+
+
+def test_agents_walk_in_their_own_scenes_as_if_alone():
+    settings = TaskSettings(width=32, height=24, budget=6, reward="proposed")
+    together = AVPVecEnv(["builtin:0", "builtin:3"], agents=4, settings=settings, seed=7)
+    alone = [AVPVecEnv(f"builtin:{scene}", agents=1, settings=settings, seed=7 + i) for i, scene in enumerate("0303")]
+    np.testing.assert_allclose(together.reset(), np.concatenate([env.reset() for env in alone]), atol=1e-6)
+    rng = np.random.default_rng(1)
+    for _ in range(6):
+        actions = rng.integers(5, size=4)
+        ours = together.step(actions)
+        theirs = [env.step(actions[i : i + 1]) for i, env in enumerate(alone)]
+        np.testing.assert_allclose(ours[0], np.concatenate([step[0] for step in theirs]), atol=1e-6)
+        np.testing.assert_allclose(ours[1], np.concatenate([step[1] for step in theirs]), atol=1e-6)
+    cells = [len(info["avp_trajectory"].first_seen) for info in ours[3]]
+    assert cells == [len(area.centres) for area in together.get_attr("area")]
+    assert cells[0] != cells[1]
+    assert together.get_attr("scene_name") == ["builtin:0", "builtin:3", "builtin:0", "builtin:3"]
+    pose = together.get_attr("camera_to_world")[1]
+    camera = Intrinsics.from_hfov(16, 12, hfov_deg=90.0)
+    (frames,) = together.env_method("capture", pose[None], camera, indices=1)
+    np.testing.assert_array_equal(frames.depth, together.simulators[1].render(pose[None], camera, rgb=False).depth)
+
+
+@pytest.mark.parametrize(
+    ("scenes", "agents", "words"),
+    [
+        (["builtin:0", "builtin:3"], 1, "agents: expected at least 2, one for each scene, got 1"),
+        ([], 1, "scene: expected at least one, got none"),
+        ("builtin:0", 10**9, r"agents: 1000000000 need about \d+\.\d GiB, \d+\.\d GiB are free"),
+    ],
+)
+def test_numbers_of_agents_that_cannot_be_are_refused(scenes, agents, words):
+    with pytest.raises(UsageError, match=words):
+        AVPVecEnv(scenes, agents=agents)
+
+
+def test_a_broken_scene_in_a_list_is_named_before_training(tmp_path):
+    broken = tmp_path / "broken.glb"
+    broken.write_bytes(b"not a mesh")
+    with pytest.raises(SceneError, match=r"broken\.glb"):
+        AVPVecEnv(["builtin:0", str(broken)], agents=4)
 
 
 def test_sb3_makes_vector_environments_of_the_id():

@@ -37,7 +37,7 @@ def recorded(tmp_path_factory):
     """One training with two environments, of which every third episode is recorded with four pictures."""
     path = tmp_path_factory.mktemp("rerun") / "train.rrd"
     notes = Notes()
-    callback = RerunCallback(path, every=3, pictures=4, width=32, height=20)
+    callback = RerunCallback(path, every=3, max_share=1, pictures=4, width=32, height=20)
     ppo(DummyVecEnv([SmallEnv, SmallEnv])).learn(128, callback=[notes, callback])
     return path, notes
 
@@ -127,7 +127,7 @@ def test_pictures_are_what_the_simulator_renders_at_those_poses(recorded):
 
 def test_a_full_file_takes_no_further_episode(tmp_path):
     path = tmp_path / "small.rrd"
-    ppo().learn(64, callback=RerunCallback(path, every=1, pictures=0, max_bytes=1))
+    ppo().learn(64, callback=RerunCallback(path, every=1, max_share=1, pictures=0, max_bytes=1))
     verify(path)
     assert not rows(path, "/plots/coverage", "Scalars:scalars")
 
@@ -165,6 +165,16 @@ def test_without_a_path_the_recording_lies_in_runs(tmp_path, monkeypatch):
 def test_numbers_that_cannot_be_right_are_refused(option, value):
     with pytest.raises(UsageError, match=rf"RerunCallback {option}: expected at least \d, got {value}"):
         RerunCallback(**{option: value})
+
+
+def test_recording_keeps_to_its_share_of_the_time(tmp_path):
+    path = tmp_path / "a.rrd"
+    ppo().learn(128, callback=RerunCallback(path, every=1, max_share=1e-9, pictures=0))
+    numbers = {time for time, _ in rows(path, "/plots/coverage", "Scalars:scalars", "episode")}
+    # The first episode is always recorded, and has used up the share for longer than this training takes.
+    assert numbers == {1}
+    with pytest.raises(UsageError, match=r"max_share: expected a number within \(0, 1\], got 0"):
+        RerunCallback(max_share=0)
 
 
 def test_an_environment_without_trajectories_is_named(tmp_path):
