@@ -22,9 +22,10 @@ _PICTURE = (480, 360)
 class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
     """An agent that walks through a scene and decides which views to take.
 
-    Observations are the twelve numbers of `observation.NAMES` (and a map with `observation="map"`), actions the six of `settings.ACTION_NAMES`. `info` of
-    every step holds `coverage`, `new_cells`, `views`, `collided`, `redundant` and `reward_parts`; the last step of an
-    episode adds `avp_episode` (figures, see `task.episode_metrics`), `avp_trajectory` and `is_success`.
+    Observations are the twelve numbers of `observation.NAMES`, with `observation="map"` followed by a map of what was
+    seen; actions are the six of `settings.ACTION_NAMES`. `info` of every step holds `coverage`, `new_cells`, `views`,
+    `collided`, `redundant` and `reward_parts`; the last step of an episode adds `avp_episode` (figures, see
+    `task.episode_metrics`), `avp_trajectory` and `is_success`.
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 4}  # noqa: RUF012 - gymnasium's own declaration

@@ -2,13 +2,14 @@
 
 import gymnasium
 import numpy as np
+from numpy.typing import NDArray
 
 from avp_habitat.map_observation import SIZE
 from avp_habitat.observation import HIGH, LOW
 from avp_habitat.settings import ACTION_NAMES
 
 
-def observation_space(kind: str) -> gymnasium.spaces.Box:
+def observation_space(kind: str) -> gymnasium.Space[NDArray[np.float32]]:
     """Observations of a kind.
 
     Args:
@@ -21,7 +22,7 @@ def observation_space(kind: str) -> gymnasium.spaces.Box:
     if kind == "map":
         low = np.concatenate([LOW, np.zeros(SIZE, np.float32)])
         high = np.concatenate([HIGH, np.ones(SIZE, np.float32)])
-    return gymnasium.spaces.Box(low, high, dtype=np.float32)
+    return gymnasium.spaces.Box(low, high, dtype=np.float32)  # type: ignore[return-value]
 
 
 def action_space() -> gymnasium.spaces.Discrete:

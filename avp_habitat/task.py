@@ -10,14 +10,14 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat import metrics, poses
+from avp_habitat import metrics, motion, poses
 from avp_habitat.agent_view import AgentView
 from avp_habitat.map_observation import SIZE as MAP_SIZE
 from avp_habitat.map_observation import MapObserver
 from avp_habitat.observation import observation
 from avp_habitat.rewards import PARTS, StepFacts, has_stop, reward_parts, stops_episode
 from avp_habitat.senses import Perception, Senses, Views, make_senses
-from avp_habitat.settings import LOOK_DOWN, LOOK_UP, MOVE_FORWARD, STOP, TURN_LEFT, TURN_RIGHT, TaskSettings
+from avp_habitat.settings import MOVE_FORWARD, STOP, TaskSettings
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.trajectory import Trajectory
 
@@ -124,7 +124,7 @@ class ViewpointTask:
     @property
     def camera_to_world(self) -> NDArray[np.float64]:
         """`(n, 4, 4)` the sensors' poses now, habitat axes."""
-        return self._sensor_poses(self.position, self.yaw, self.pitch)
+        return motion.sensor_poses(self.settings, self.position, self.yaw, self.pitch)
 
     def reset(self, rows: Sequence[int] | NDArray[np.integer], position: Float, yaw: Float) -> NDArray[np.float32]:
         """Start new episodes of some agents, looking straight ahead.
@@ -184,7 +184,7 @@ class ViewpointTask:
             position=position,
             yaw=yaw,
             pitch=pitch,
-            camera_to_world=self._sensor_poses(position, yaw, pitch),
+            camera_to_world=motion.sensor_poses(self.settings, position, yaw, pitch),
             action=log["action"].astype(np.int64),
             reward=log["reward"],
             reward_parts={name: log[f"part {name}"] for name in PARTS},
@@ -217,11 +217,7 @@ class ViewpointTask:
 
     def _views(self, rows: Rows) -> Views:
         position, yaw, pitch = self.position[rows], self.yaw[rows], self.pitch[rows]
-        return Views(position, yaw, pitch, self._sensor_poses(position, yaw, pitch))
-
-    def _sensor_poses(self, position: Float, yaw: Float, pitch: Float) -> NDArray[np.float64]:
-        raised = position + np.array([0.0, self.settings.sensor_height_m, 0.0])
-        return poses.camera_to_world(raised, yaw=yaw, pitch=pitch)
+        return Views(position, yaw, pitch, motion.sensor_poses(self.settings, position, yaw, pitch))
 
     def _remember(self, rows: Rows) -> None:
         """Enter where some agents are now into their paths."""
@@ -233,19 +229,14 @@ class ViewpointTask:
 
     def _move(self, actions: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Apply the actions; `(n,)` whether a forward move was blocked."""
-        settings = self.settings
-        turn, tilt = np.radians(settings.turn_deg), np.radians(settings.tilt_deg)
-        limit = np.radians(settings.pitch_limit_deg)
-        self.yaw = poses.wrap_angle(self.yaw + turn * ((actions == TURN_LEFT) * 1.0 - (actions == TURN_RIGHT)))
-        pitch = self.pitch + tilt * ((actions == LOOK_UP) * 1.0 - (actions == LOOK_DOWN))
-        self.pitch = np.clip(pitch, -limit, limit)
+        self.yaw, self.pitch = motion.turn(self.settings, actions, self.yaw, self.pitch)
         collided = np.zeros(self.agents, dtype=np.bool_)
         walking = np.flatnonzero(actions == MOVE_FORWARD)
         for room, chosen in self._by_room(walking):
             rows = walking[chosen]
             before = self.position[rows]
-            after = room.simulator.area.slide(before, poses.heading(self.yaw[rows]) * settings.forward_m)
-            collided[rows] = np.linalg.norm((after - before)[:, [0, 2]], axis=1) < settings.collision_m
+            after = motion.walk(room.simulator.area, self.settings, actions[rows], before, self.yaw[rows])
+            collided[rows] = np.linalg.norm((after - before)[:, [0, 2]], axis=1) < self.settings.collision_m
             self.position[rows] = after
         return collided
 
@@ -284,7 +275,7 @@ class ViewpointTask:
             steps_left=self.settings.budget - self.steps,
         )
 
-    def _observe(self, rows: Rows, seen: Perception, spread_m: Float) -> NDArray[np.float32]:
+    def _observe(self, rows: Rows, seen: Perception, spread_m: NDArray[np.number]) -> NDArray[np.float32]:
         radius = self._diameter[rows]
         numbers = observation(
             progress=self.steps[rows] / self.settings.budget,
@@ -295,7 +286,7 @@ class ViewpointTask:
             mean_depth=seen.mean,
             coverage=self.coverage[rows],
             collided=self._collided[rows],
-            spread=spread_m / radius,
+            spread=np.asarray(spread_m / radius),
         )
         if self.settings.observation == "numbers":
             return numbers

@@ -147,7 +147,7 @@ _OF_AGENT = {
 def _check_memory(agents: int, simulators: Sequence[Simulator], settings: TaskSettings) -> None:
     """Refuse what would end in the middle of making it: the agents' cells, paths, logs and newest observations."""
     cells = max(len(simulator.area.centres) for simulator in simulators)
-    numbers = int(np.prod(observation_space(settings.observation).shape))
+    numbers = gymnasium.spaces.flatdim(observation_space(settings.observation))
     needed = agents * (2 * cells + 8 * 24 * (settings.budget + 1) + 3 * 4 * numbers)
     free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if needed > free:

@@ -4,6 +4,8 @@ import argparse
 import json
 import multiprocessing
 import os
+import platform
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -16,6 +18,7 @@ from tqdm import tqdm
 from avp_habitat import command
 from avp_habitat.rewards import RewardConstants
 from avp_habitat.settings import TaskSettings
+from avp_sb3.run_facts import git_commit
 
 EXPERIMENT = "avp-reward-search"
 VIEWS_WEIGHT = 0.3
@@ -90,7 +93,40 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     figures = _evaluate(model, trial.scenes, settings)
     figures["score"] = score(figures["coverage"], figures["views"], settings.budget)
     _log(tracking.run_id, figures)
-    return {"trial": trial.number, "run": tracking.run_id, **asdict(trial.constants), **figures}
+    about = {"run": tracking.run_id, "commit": git_commit(), "steps": trial.steps, "scenes": _names(trial.scenes)}
+    return {"trial": trial.number, "seed": trial.seed, **about, "constants": asdict(trial.constants), **figures}
+
+
+def _names(scenes: Sequence[str]) -> list[str]:
+    """Scenes without their folders."""
+    return [Path(scene).name for scene in scenes]
+
+
+def is_done(trial: Trial, done: Sequence[dict[str, Any]]) -> bool:
+    """Whether a trial's figures are known."""
+    wanted = (trial.seed, trial.steps, _names(trial.scenes), asdict(trial.constants))
+    return any((one["seed"], one["steps"], one["scenes"], one["constants"]) == wanted for one in done)
+
+
+def write(out: Path, done: Sequence[dict[str, Any]]) -> None:
+    """JSON, and beside it the same as a Markdown table, the best trial first."""
+    trials = sorted(done, key=lambda trial: -trial["score"])
+    out.parent.mkdir(parents=True, exist_ok=True)
+    machine = f"{platform.machine()}, {os.cpu_count()} cores"
+    about = {"command": shlex.join(["python", "scripts/search_rewards.py", *sys.argv[1:]]), "machine": machine}
+    out.write_text(json.dumps({**about, "trials": trials}, indent=1) + "\n", encoding="utf-8")
+    varied = [*_RANGES, "beta"]
+    figures = ["score", "coverage", "views", "stopped"]
+    lines = [f"| {' | '.join(['trial', *figures, *varied])} |", "|" + " --- |" * (1 + len(figures) + len(varied))]
+    for trial in trials:
+        values = [*(trial[name] for name in figures), *(trial["constants"][name] for name in varied)]
+        lines.append(f"| {trial['trial']} | {' | '.join(f'{value:.3g}' for value in values)} |")
+    out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def read(out: Path) -> list[dict[str, Any]]:
+    """The trials of an earlier call."""
+    return json.loads(out.read_text(encoding="utf-8"))["trials"] if out.exists() else []
 
 
 def _evaluate(model: Any, scenes: Sequence[str], settings: TaskSettings, episodes: int = 64) -> dict[str, float]:
@@ -123,35 +159,35 @@ def _parser() -> argparse.ArgumentParser:
     add("--steps", default=400_000, type=int, help="environment steps of each")
     add("--jobs", default=2, type=int, help="trainings at a time")
     add("--seed", default=0, type=int, help="of the draws, the policies and the starts")
-    add("--out", default=Path("runs/reward-search.json"), type=Path, help="all trials, the best first")
+    add("--out", default=Path("docs/results/reward_search.json"), type=Path, help="all trials, the best first")
     return parser
 
 
 def main(argv: Sequence[str]) -> None:
-    """Run the trials; print and write them, the best first. After Ctrl-C those that are done are kept."""
+    """Run the trials that are not in the output file yet; what is done is kept after Ctrl-C."""
     options = _parser().parse_args(argv)
     os.environ.setdefault("MLFLOW_TRACKING_URI", "sqlite:///mlflow.db")
     os.environ["OMP_NUM_THREADS"] = "1"
+    done = read(options.out)
     trials = [
         Trial(number, draw_constants(number, options.seed), tuple(options.scene), options.steps, options.seed)
         for number in range(options.trials)
     ]
+    trials = [trial for trial in trials if not is_done(trial, done)]
     # Made before the processes start: two that make one sqlite file's tables at a time get in each other's way.
     import mlflow
 
     if mlflow.get_experiment_by_name(EXPERIMENT) is None:
         mlflow.create_experiment(EXPERIMENT)
-    done: list[dict[str, Any]] = []
     # Forked processes would share MLflow's and Open3D's threads.
     with multiprocessing.get_context("spawn").Pool(options.jobs) as pool, tqdm(total=len(trials), unit="trial") as bar:
         for result in pool.imap_unordered(run_trial, trials):
             done.append(result)
             bar.update()
-            bar.write(f"trial {result['trial']}: " + ", ".join(f"{k} {result[k]:.3f}" for k in list(result)[-6:]))
-            done.sort(key=lambda trial: -trial["score"])
-            options.out.parent.mkdir(parents=True, exist_ok=True)
-            options.out.write_text(json.dumps({"command": sys.argv, "trials": done}, indent=1) + "\n")
-    print(f"{options.out}: {len(done)} trials; best {done[0]['trial']}")
+            bar.write(f"trial {result['trial']}: score {result['score']:.3f}")
+            write(options.out, done)
+    write(options.out, done)
+    print(f"{options.out}: {len(done)} trials, in MLflow's experiment {EXPERIMENT!r}")
 
 
 if __name__ == "__main__":

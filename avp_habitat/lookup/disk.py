@@ -22,7 +22,7 @@ def cache_folder() -> Path | None:
 
 
 class TileFiles:
-    """The files of one scene's tables; a file that cannot be used is made anew, one that cannot be written is missed."""
+    """The files of one scene's tables: an unsound one is made anew, one that cannot be written costs a warning."""
 
     def __init__(self, name: str) -> None:
         """Use the folder `name` of the cache."""

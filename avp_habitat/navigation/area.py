@@ -83,7 +83,7 @@ class NavigableArea:
         points = np.array(points, dtype=np.float64)
         outside = np.flatnonzero(~self.contains(points))
         if len(outside):
-            points[np.ix_(outside, [0, 2])] = self._nearest_on_outline(_on_plane(points[outside]))
+            points[outside, 0], points[outside, 2] = self._nearest_on_outline(_on_plane(points[outside])).T
         return points
 
     def _nearest_on_outline(self, on_plane: Float) -> Float:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from avp_habitat.oracle.motion import sensor_poses
+from avp_habitat.motion import sensor_poses
 from avp_habitat.poses import Intrinsics, pixel_directions
 from avp_habitat.settings import TaskSettings
 from avp_habitat.simulators.base import Simulator

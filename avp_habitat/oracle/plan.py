@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from avp_habitat.agent_view import AgentView
 from avp_habitat.coverage import candidates
 from avp_habitat.errors import UsageError
+from avp_habitat.motion import act, sensor_poses
 from avp_habitat.oracle.lattice import lattice_of, pack
-from avp_habitat.oracle.motion import act, sensor_poses
 from avp_habitat.oracle.search import BeamSettings, beam_search
 from avp_habitat.oracle.states import start_state
 from avp_habitat.oracle.tour import covering_tour

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from avp_habitat.motion import act, sensor_poses
 from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.oracle.lattice import Lattice, image_borders
-from avp_habitat.oracle.motion import act, sensor_poses
 from avp_habitat.oracle.states import States
 from avp_habitat.poses import wrap_angle
 from avp_habitat.settings import LOOK_DOWN, LOOK_UP, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, TaskSettings

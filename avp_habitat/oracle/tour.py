@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from avp_habitat.motion import act
 from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.oracle.cover import greedy_cover
 from avp_habitat.oracle.lattice import Bits, Lattice, views_from
-from avp_habitat.oracle.motion import act
 from avp_habitat.oracle.states import States
 from avp_habitat.poses import wrap_angle
 from avp_habitat.settings import LOOK_DOWN, LOOK_UP, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, TaskSettings
