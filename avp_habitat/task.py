@@ -286,7 +286,7 @@ class ViewpointTask:
             mean_depth=seen.mean,
             coverage=self.coverage[rows],
             collided=self._collided[rows],
-            spread=np.asarray(spread_m / radius),
+            spread=np.asarray(spread_m, dtype=np.float64) / radius,
         )
         if self.settings.observation == "numbers":
             return numbers

@@ -49,7 +49,7 @@ class Configuration:
 
 
 CONFIGURATIONS = (
-    Configuration("coverage, 12 numbers", "coverage", "numbers", "one", 1_000_000, 3),
+    Configuration("coverage, 12 numbers", "coverage", "numbers", "one", 1_500_000, 3),
     Configuration("coverage, map", "coverage", "map", "one", 1_000_000, 3),
     Configuration("coverage + redundancy, map", "coverage_redundancy", "map", "one", 1_000_000, 3),
     Configuration("proposed, 12 numbers", "proposed", "numbers", "one", 1_000_000, 3),
