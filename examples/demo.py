@@ -35,7 +35,7 @@ class Settings:
 
     scene: str = "builtin:0"
     """The room."""
-    steps: int = 100_000
+    steps: int = 300_000
     """Environment steps of the training."""
     iterations: int = 1000
     """Of each reconstruction."""
@@ -90,9 +90,9 @@ class Demo:
         """PPO with the suite's callbacks; gives the model."""
         model, recording = self.folder / "learned.zip", self.folder / "training.rrd"
         options = ("--scene", self.settings.scene, "--steps", self.settings.steps, "--seed", self.settings.seed)
-        camera = ("--width", 64, "--height", 48)
+        observation = ("--observation", "map")
         target = ("--out", model, "--recording", recording, "--run-name", "demo-training")
-        line = ("python", os.path.relpath(Path(__file__).with_name("train.py")), *options, *camera, *target)
+        line = ("python", os.path.relpath(Path(__file__).with_name("train.py")), *options, *observation, *target)
         self.run("train a policy", *line, fresh=[model, recording])
         return model
 

@@ -16,7 +16,10 @@ def env():
 
 def test_a_training_in_a_furnished_room_feeds_all_trackers(env, tmp_path, monkeypatch):
     client = MlflowClient(mlflow_home(tmp_path, monkeypatch))
-    mlflow_callback, rerun_callback = MLflowCallback(), RerunCallback(tmp_path / "a.rrd", every=2, max_share=1, pictures=3)
+    mlflow_callback, rerun_callback = (
+        MLflowCallback(),
+        RerunCallback(tmp_path / "a.rrd", every=2, max_share=1, pictures=3),
+    )
     ppo(env).learn(128, callback=[MetricsCallback(), mlflow_callback, rerun_callback])
 
     run = client.get_run(mlflow_callback.run_id)

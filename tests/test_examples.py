@@ -1,7 +1,10 @@
 import json
 import os
+import shlex
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -46,6 +49,8 @@ def test_the_training_script_trains_tracks_and_saves(tmp_path):
         (("--agents", 3), "--agents: expected a divisor of PPO's buffer of 2048 steps, got 3"),
         (("--reward", "cover"), "unknown reward 'cover'"),
         (("--steps", 0), "--steps: expected at least 1, got 0"),
+        (("--observation", "maps"), "unknown observation 'maps': expected one of map, numbers; did you mean 'map'?"),
+        (("--resume", "no.zip"), "--resume no.zip: no such model file"),
     ],
 )
 def test_wrong_options_of_the_training_end_before_anything_is_loaded(tmp_path, words, error):
@@ -54,6 +59,40 @@ def test_wrong_options_of_the_training_end_before_anything_is_loaded(tmp_path, w
     assert error in done.stderr
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_an_interrupted_training_keeps_its_model_and_goes_on_by_the_printed_command(tmp_path):
+    env = {**os.environ, "MLFLOW_TRACKING_URI": f"sqlite:///{tmp_path / 'mlflow.db'}", "PYTHONWARNINGS": "ignore"}
+    line = [sys.executable, str(ROOT / "examples" / "train.py"), "--agents", "8", "--rays", "--out", "model.zip"]
+    line += ["--width", "16", "--height", "12"]
+    training = subprocess.Popen(line, cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    client, steps = MlflowClient(env["MLFLOW_TRACKING_URI"]), 0
+    for _ in range(600):
+        time.sleep(0.2)
+        steps = sampled_steps(client) if (tmp_path / "mlflow.db").exists() else 0
+        if steps:
+            break
+    training.send_signal(signal.SIGINT)
+    out, err = training.communicate(timeout=60)
+    assert training.returncode == 130
+    assert "Traceback" not in err
+    assert (tmp_path / "model.zip").exists()
+    (again,) = [text.removeprefix("to go on:") for text in out.splitlines() if text.startswith("to go on:")]
+    words = shlex.split(again)
+    assert words[:2] == ["python", "examples/train.py"]
+    done = int(out.split("the policy after ")[1].split()[0])
+    resumed = run("train.py", *words[2:], "--steps", done + 1, folder=tmp_path)
+    assert resumed.returncode == 0, resumed.stderr
+    assert f"model.zip: the policy after {done + 2048} steps" in resumed.stdout
+    states = sorted(found.info.status for found in client.search_runs(["1"]))
+    assert states == ["FINISHED", "KILLED"]
+
+
+def sampled_steps(client):
+    """Environment steps of the newest point that the only training has logged, 0 before the first."""
+    found = client.search_runs(["1"])
+    return int(found[0].data.metrics.get("time/total_timesteps", 0)) if found else 0
 
 
 @pytest.mark.slow

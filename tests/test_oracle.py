@@ -11,10 +11,10 @@ from avp_habitat.baselines import RandomPolicy
 from avp_habitat.coverage import candidates
 from avp_habitat.env import AVPEnv
 from avp_habitat.errors import UsageError
+from avp_habitat.motion import act, sensor_poses
 from avp_habitat.oracle import OraclePolicy
 from avp_habitat.oracle.cover import greedy_cover
 from avp_habitat.oracle.lattice import lattice_of, make_lattice, pack, unpack, views_from
-from avp_habitat.motion import act, sensor_poses
 from avp_habitat.oracle.plan import make_plan, planned_coverage
 from avp_habitat.oracle.search import BeamSettings, beam_search
 from avp_habitat.oracle.states import start_state
