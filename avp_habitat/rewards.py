@@ -22,7 +22,7 @@ class RewardConstants:
 
     alpha: float = 0.004
     """α of `coverage` and `coverage_redundancy`: reward per newly observed cell (0.01 m²)."""
-    alpha_proposed: float = 0.0075
+    alpha_proposed: float = 0.01
     """α of `proposed`: reward per (newly observed cell)^β."""
     beta: float = 0.9
     """β of `proposed`, no unit, below 1: many new cells at once count less than the same cells one after another."""

@@ -48,7 +48,7 @@ class TaskSettings:
     coverage_mode: Literal["visible", "over"] = "visible"
     """visible: a cell's floor point is seen. over: a camera ray passes over the cell."""
     observation: Literal["numbers", "map"] = "numbers"
-    """numbers: the twelve of the design. map: these, and a map of what was seen around the agent."""
+    """numbers: the twelve of the design. map: these, whether C ≥ τ, and a map of what was seen around the agent."""
     lookup: bool = False
     """Whether views are looked up in tables of the scene instead of casting all their rays: faster, for training."""
 

@@ -16,12 +16,12 @@ def observation_space(kind: str) -> gymnasium.Space[NDArray[np.float32]]:
         kind: one of `settings.OBSERVATION_NAMES`.
 
     Returns:
-        `(12,)` for `numbers`, `(12 + map_observation.SIZE,)` for `map`, float32.
+        `(12,)` for `numbers`; `(13 + map_observation.SIZE,)` for `map`: the numbers, whether C ≥ τ, and the map; float32.
     """
     low, high = LOW, HIGH
     if kind == "map":
-        low = np.concatenate([LOW, np.zeros(SIZE, np.float32)])
-        high = np.concatenate([HIGH, np.ones(SIZE, np.float32)])
+        low = np.concatenate([LOW, np.zeros(1 + SIZE, np.float32)])
+        high = np.concatenate([HIGH, np.ones(1 + SIZE, np.float32)])
     return gymnasium.spaces.Box(low, high, dtype=np.float32)  # type: ignore[return-value]
 
 

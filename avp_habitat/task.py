@@ -290,10 +290,11 @@ class ViewpointTask:
         )
         if self.settings.observation == "numbers":
             return numbers
-        maps = np.empty((len(rows), MAP_SIZE), dtype=np.float32)
+        maps = np.empty((len(rows), 1 + MAP_SIZE), dtype=np.float32)
+        maps[:, 0] = self.coverage[rows] >= self.settings.constants.stop_coverage
         for room, chosen in self._by_room(rows):
             at = rows[chosen]
-            maps[chosen] = room.maps.observe(self._first_seen, at, self.position[at], self.yaw[at])
+            maps[chosen, 1:] = room.maps.observe(self._first_seen, at, self.position[at], self.yaw[at])
         return np.concatenate([numbers, maps], axis=1)
 
     def _record(

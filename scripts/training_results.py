@@ -49,13 +49,13 @@ class Configuration:
 
 
 CONFIGURATIONS = (
-    Configuration("coverage, 12 numbers", "coverage", "numbers", "one", 1_500_000, 3),
-    Configuration("coverage, map", "coverage", "map", "one", 1_000_000, 3),
-    Configuration("coverage + redundancy, map", "coverage_redundancy", "map", "one", 1_000_000, 3),
-    Configuration("proposed, 12 numbers", "proposed", "numbers", "one", 1_000_000, 3),
-    Configuration("proposed, map", "proposed", "map", "one", 1_200_000, 3),
-    Configuration("coverage, map, many rooms", "coverage", "map", "many", 2_500_000, 1),
-    Configuration("proposed, map, many rooms", "proposed", "map", "many", 2_500_000, 3),
+    Configuration("coverage, 12 numbers", "coverage", "numbers", "one", 1_250_000, 3),
+    Configuration("coverage, map", "coverage", "map", "one", 800_000, 3),
+    Configuration("coverage + redundancy, map", "coverage_redundancy", "map", "one", 800_000, 1),
+    Configuration("proposed, 12 numbers", "proposed", "numbers", "one", 800_000, 3),
+    Configuration("proposed, map", "proposed", "map", "one", 1_000_000, 3),
+    Configuration("coverage, map, many rooms", "coverage", "map", "many", 1_800_000, 1),
+    Configuration("proposed, map, many rooms", "proposed", "map", "many", 1_800_000, 3),
 )
 
 

@@ -3,6 +3,7 @@ import pytest
 from corridor import Corridor
 
 from avp_habitat.map_observation import CELL_M, CHANNELS, SIDE, MapObserver
+from avp_habitat.rewards import RewardConstants
 from avp_habitat.settings import TaskSettings
 from avp_habitat.task import ViewpointTask
 
@@ -71,11 +72,15 @@ def test_nothing_that_was_not_seen_enters_the_map():
     np.testing.assert_array_equal(drawn, MapObserver(other).observe(seen_there, *here))
 
 
-def test_the_observation_is_the_twelve_numbers_followed_by_the_map():
-    tasks = [ViewpointTask(Corridor(), TaskSettings(observation=kind), agents=2) for kind in ("numbers", "map")]
+def test_the_observation_is_the_twelve_numbers_whether_stop_would_do_and_the_map():
+    constants = RewardConstants(stop_coverage=0.1)
+    settings = [TaskSettings(observation=kind, constants=constants) for kind in ("numbers", "map")]
+    tasks = [ViewpointTask(Corridor(), each, agents=2) for each in settings]
     for task in tasks:
         task.reset(range(2), AREA.centres[[5, 300]], np.array([0.0, 2.0]))
     numbers, with_map = (task.step(np.array([1, 0])).observation for task in tasks)
     np.testing.assert_array_equal(with_map[:, :12], numbers)
     drawn = MapObserver(AREA).observe(tasks[1]._first_seen, np.arange(2), tasks[1].position, tasks[1].yaw)
-    np.testing.assert_array_equal(with_map[:, 12:], drawn)
+    np.testing.assert_array_equal(with_map[:, 13:], drawn)
+    assert tasks[1].coverage[1] < 0.1 < tasks[1].coverage[0]
+    assert with_map[:, 12].tolist() == [1.0, 0.0]
