@@ -73,15 +73,15 @@ def test_nothing_that_was_not_seen_enters_the_map():
 
 
 def test_the_observation_is_the_twelve_numbers_whether_stop_would_do_and_the_map():
-    constants = RewardConstants(stop_coverage=0.02)
+    constants = RewardConstants(stop_coverage=0.1)
     settings = [TaskSettings(observation=kind, constants=constants) for kind in ("numbers", "map")]
     tasks = [ViewpointTask(Corridor(), each, agents=2) for each in settings]
     for task in tasks:
-        task.reset(range(2), AREA.centres[[5, 300]], np.array([-np.pi / 2, 0.0]))
+        task.reset(range(2), AREA.centres[[5, 300]], np.array([np.pi, 0.0]))
     numbers, with_map = (task.step(np.array([1, 1])).observation for task in tasks)
     np.testing.assert_array_equal(with_map[:, :12], numbers)
     drawn = MapObserver(AREA).observe(tasks[1]._first_seen, np.arange(2), tasks[1].position, tasks[1].yaw)
     np.testing.assert_array_equal(with_map[:, 13:], drawn)
-    reached = tasks[1].coverage >= 0.02
+    reached = tasks[1].coverage >= 0.1
     assert set(reached) == {True, False}
     np.testing.assert_array_equal(with_map[:, 12], reached)
