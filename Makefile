@@ -1,6 +1,6 @@
 # Every target sets up what it needs first; a second run starts in seconds.
 BIN := .venv/bin
-SOURCES := avp_habitat avp_sb3 avp_nerfstudio examples benchmarks tests
+SOURCES := avp_habitat avp_sb3 avp_nerfstudio examples benchmarks scripts tests
 
 .PHONY: help setup demo test test-all check lint format clean
 

@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
+from avp_sb3.evaluation_statistics import mean_and_half_width
 
 ROOT = Path(__file__).resolve().parent.parent
 BASELINES = ("heuristic", "random", "spin", "frontier", "greedy", "oracle")
@@ -186,6 +187,29 @@ def draw_training_curves(trainings: Sequence[Trained], picture: Path) -> None:
     figure.savefig(picture, dpi=120)
 
 
+def draw_comparison(results: Sequence[Any], picture: Path) -> None:
+    """Mean coverage by view: baselines dashed, learned policies solid, a dot where those that stop do so on average."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 4.8), layout="constrained")
+    axes = figure.subplots()
+    for result in results:
+        learned = result.policy not in BASELINES
+        mean, half = mean_and_half_width(100 * result.curve)
+        views = np.arange(1, len(mean) + 1)
+        label = f"{result.policy} ({len(result.seeds)} episodes)"
+        (line,) = axes.plot(views, mean, "-" if learned else "--", linewidth=2 if learned else 1.2, label=label)
+        if learned:
+            axes.fill_between(views, mean - half, mean + half, color=line.get_color(), alpha=0.15, linewidth=0)
+        if result.figures["stopped"].any():
+            end = float(result.figures["views"].mean())
+            axes.plot(end, np.interp(end, views, mean), "o", color=line.get_color())
+    axes.set(xlabel="views", ylabel="coverage [%]", ylim=(0, 100), xlim=(1, len(mean)))
+    axes.grid(alpha=0.3)
+    figure.legend(loc="outside right upper", fontsize="small")
+    figure.savefig(picture, dpi=120)
+
+
 def _history(client: Any, training: Trained, metric: str) -> tuple[list[int], list[float]]:
     """Steps and values of a metric in a training's run."""
     from stable_baselines3 import PPO
@@ -218,6 +242,7 @@ def write_results(options: argparse.Namespace, trainings: Sequence[Trained], arg
                 file.unlink()
             folder.rmdir()
         write_report(folder, results, about | {"scene": {"name": Path(scene).name}})
+        draw_comparison(results, folder / "coverage.png")
         text += [
             "",
             f"## {Path(scene).name}",
