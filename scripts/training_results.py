@@ -13,6 +13,7 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -233,7 +234,7 @@ def write_results(options: argparse.Namespace, trainings: Sequence[Trained], arg
     ]
     for scene in (options.scene, options.unseen):
         name = Path(scene).stem.replace(":", "_")
-        results = read_report(options.work / f"baselines-on-{name}")
+        results = read_report(_baselines(options.work, scene))
         for _, group in itertools.groupby(trainings, key=lambda training: training.configuration):
             results.append(pooled(list(group), scene))
         folder = out / name
@@ -257,6 +258,11 @@ def write_results(options: argparse.Namespace, trainings: Sequence[Trained], arg
     (out / "configurations.json").write_text(
         json.dumps([c.__dict__ for c in CONFIGURATIONS], indent=1) + "\n", encoding="utf-8"
     )
+
+
+def _baselines(work: Path, scene: str) -> Path:
+    """The folder of the baselines' evaluation on a scene."""
+    return work / f"baselines-on-{Path(scene).stem.replace(':', '_')}"
 
 
 def _transposed(markdown: str) -> str:
@@ -301,12 +307,10 @@ def main(argv: Sequence[str]) -> None:
         for seed in range(configuration.seeds)
     ]
     longest = sorted(trainings, key=lambda training: -training.configuration.steps)
-    in_parallel(options.jobs, "training", [lambda t=t: t.train(options.scene, rooms) for t in longest])
+    in_parallel(options.jobs, "training", [partial(training.train, options.scene, rooms) for training in longest])
     scenes = (options.scene, options.unseen)
-    tasks = [lambda t=t, s=s: t.evaluate(s) for t in trainings for s in scenes]
-    for scene in scenes:
-        out = options.work / f"baselines-on-{Path(scene).stem.replace(':', '_')}"
-        tasks.insert(0, lambda s=scene, out=out: evaluate(s, BASELINES, out, "coverage"))
+    tasks = [partial(evaluate, scene, BASELINES, _baselines(options.work, scene), "coverage") for scene in scenes]
+    tasks += [partial(training.evaluate, scene) for training in trainings for scene in scenes]
     in_parallel(options.jobs, "evaluating", tasks)
     if not options.only:
         write_results(options, trainings, argv)
