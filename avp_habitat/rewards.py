@@ -22,7 +22,7 @@ class RewardConstants:
 
     alpha: float = 0.004
     """α of `coverage` and `coverage_redundancy`: reward per newly observed cell (0.01 m²)."""
-    alpha_proposed: float = 0.0135
+    alpha_proposed: float = 0.0088
     """α of `proposed`: reward per (newly observed cell)^β."""
     beta: float = 0.9
     """β of `proposed`, no unit, below 1: many new cells at once count less than the same cells one after another."""
@@ -32,7 +32,7 @@ class RewardConstants:
     """λ_s: reward per metre between the agent and the mean of the positions it visited."""
     spread_limit_m: float = 3.0
     """r_max in metres: more distance than this earns nothing more."""
-    step: float = 0.025
+    step: float = 0.045
     """P_step: cost of each step."""
     collision: float = 0.05
     """P_collision: cost of a forward move that was blocked."""
@@ -42,9 +42,9 @@ class RewardConstants:
     """d_red in metres: below one forward move, so that walking on is never redundant."""
     redundancy_angle_deg: float = 5.0
     """δ in degrees, for yaw and pitch alike: below one turn, so that turning on is never redundant."""
-    stop_bonus: float = 1.5
+    stop_bonus: float = 1.0
     """B_s: reward of stopping with enough coverage."""
-    stop_per_step_left: float = 0.03
+    stop_per_step_left: float = 0.01
     """λ_e: further reward per step of the budget that was not used."""
     early_stop: float = 0.02
     """Cost of choosing stop with too little coverage."""
