@@ -99,14 +99,6 @@ class Trained:
         run(words + (["--resume", str(self.model)] if self.model.exists() else []), self.folder / f"{self.key}.log")
         self.marker.touch()
 
-    def evaluate(self, scene: str) -> None:
-        """Evaluate on a scene."""
-        evaluate(scene, [str(self.model)], self.report(scene), self.configuration.reward)
-
-    def report(self, scene: str) -> Path:
-        """The folder of its evaluation on a scene."""
-        return self.folder / f"{self.key}-on-{Path(scene).stem.replace(':', '_')}"
-
 
 def run(words: Sequence[str], log: Path) -> None:
     """Run a command of the project in its root; its output goes to a file.
@@ -148,11 +140,12 @@ def in_parallel(jobs: int, title: str, tasks: Sequence[Any]) -> None:
             raise
 
 
-def pooled(trainings: Sequence[Trained], scene: str) -> Any:
+def pooled(trainings: Sequence[Trained], work: Path, scene: str) -> Any:
     """The results of all seeds of a configuration on a scene, as one."""
     from avp_sb3.evaluation_report import read_report
 
-    parts = [read_report(training.report(scene))[0] for training in trainings]
+    found = {part.policy: part for part in read_report(_report(work, trainings[0].configuration.reward, scene))}
+    parts = [found[str(training.model)] for training in trainings]
     return replace(
         parts[0],
         policy=trainings[0].configuration.name,
@@ -234,9 +227,9 @@ def write_results(options: argparse.Namespace, trainings: Sequence[Trained], arg
     ]
     for scene in (options.scene, options.unseen):
         name = Path(scene).stem.replace(":", "_")
-        results = read_report(_baselines(options.work, scene))
+        results = read_report(_report(options.work, "baselines", scene))
         for _, group in itertools.groupby(trainings, key=lambda training: training.configuration):
-            results.append(pooled(list(group), scene))
+            results.append(pooled(list(group), options.work, scene))
         folder = out / name
         if folder.exists():
             for file in folder.iterdir():
@@ -260,9 +253,9 @@ def write_results(options: argparse.Namespace, trainings: Sequence[Trained], arg
     )
 
 
-def _baselines(work: Path, scene: str) -> Path:
-    """The folder of the baselines' evaluation on a scene."""
-    return work / f"baselines-on-{Path(scene).stem.replace(':', '_')}"
+def _report(work: Path, name: str, scene: str) -> Path:
+    """The folder of an evaluation on a scene."""
+    return work / f"{name}-on-{Path(scene).stem.replace(':', '_')}"
 
 
 def _transposed(markdown: str) -> str:
@@ -309,8 +302,12 @@ def main(argv: Sequence[str]) -> None:
     longest = sorted(trainings, key=lambda training: -training.configuration.steps)
     in_parallel(options.jobs, "training", [partial(training.train, options.scene, rooms) for training in longest])
     scenes = (options.scene, options.unseen)
-    tasks = [partial(evaluate, scene, BASELINES, _baselines(options.work, scene), "coverage") for scene in scenes]
-    tasks += [partial(training.evaluate, scene) for training in trainings for scene in scenes]
+    tasks = [
+        partial(evaluate, scene, BASELINES, _report(options.work, "baselines", scene), "coverage") for scene in scenes
+    ]
+    for scene, reward in itertools.product(scenes, sorted({t.configuration.reward for t in trainings})):
+        models = [str(training.model) for training in trainings if training.configuration.reward == reward]
+        tasks.append(partial(evaluate, scene, models, _report(options.work, reward, scene), reward))
     in_parallel(options.jobs, "evaluating", tasks)
     if not options.only:
         write_results(options, trainings, argv)
