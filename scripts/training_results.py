@@ -53,9 +53,9 @@ class Configuration:
 CONFIGURATIONS = (
     Configuration("coverage, 12 numbers", "coverage", "numbers", "one", 1_250_000, 3),
     Configuration("coverage, map", "coverage", "map", "one", 700_000, 3),
-    Configuration("coverage + redundancy, map", "coverage_redundancy", "map", "one", 700_000, 1),
-    Configuration("proposed, 12 numbers", "proposed", "numbers", "one", 500_000, 3),
-    Configuration("proposed, map", "proposed", "map", "one", 800_000, 3),
+    Configuration("coverage + redundancy, map", "coverage_redundancy", "map", "one", 400_000, 1),
+    Configuration("proposed, 12 numbers", "proposed", "numbers", "one", 300_000, 3),
+    Configuration("proposed, map", "proposed", "map", "one", 700_000, 3),
     Configuration("coverage, map, many rooms", "coverage", "map", "many", 1_800_000, 1),
     Configuration("proposed, map, many rooms", "proposed", "map", "many", 1_400_000, 2),
 )
