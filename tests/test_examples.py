@@ -24,7 +24,8 @@ def run(script, *words, folder):
 
 def test_the_training_script_trains_tracks_and_saves(tmp_path):
     camera = ("--width", 16, "--height", 12)
-    words = ("--steps", 2048, "--out", "model.zip", "--recording", "training.rrd", "--run-name", "tiny", *camera)
+    words = ("--steps", 2048, "--agents", 16, "--out", "model.zip", "--recording", "training.rrd", *camera)
+    words += ("--run-name", "tiny")
     done = run("train.py", *words, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "model.zip: the policy after 2048 steps" in done.stdout
