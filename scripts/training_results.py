@@ -205,11 +205,15 @@ def draw_comparison(results: Sequence[Any], picture: Path) -> None:
 
 
 def _history(client: Any, training: Trained, metric: str) -> tuple[list[int], list[float]]:
-    """Steps and values of a metric in a training's run."""
+    """Steps and values of a metric in a training's run, and in those that it continued."""
     from stable_baselines3 import PPO
 
     run_id = PPO.load(training.model, device="cpu").avp_mlflow_run_id  # type: ignore[attr-defined]
-    points = sorted((point.step, point.value) for point in client.get_metric_history(run_id, metric))
+    points = []
+    while run_id is not None:
+        points += [(point.step, point.value) for point in client.get_metric_history(run_id, metric)]
+        run_id = client.get_run(run_id).data.tags.get("avp.continued_from")
+    points.sort()
     return [step for step, _ in points], [value for _, value in points]
 
 
