@@ -6,7 +6,7 @@ import time
 import warnings
 from dataclasses import dataclass
 from numbers import Real
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Any
 
 from mlflow import MlflowClient
@@ -17,6 +17,10 @@ FORMAT = "mlflow"
 """The name by which `logger.record(..., exclude="mlflow")` keeps a value away from MLflow."""
 _UNSAFE = re.compile(r"[^\w.\- /]")
 _MAX_NAME, _MAX_TAG = 250, 5000
+_MAX_METRICS = 1000
+"""Of one call of MLflow."""
+_INTERVAL_S = 5.0
+"""Time between two calls while a training runs."""
 
 
 def safe_name(name: str) -> str:
@@ -98,11 +102,34 @@ class MLflowWriter(KVWriter):
             self._thread.start()
 
     def _send_all(self) -> None:
-        while (batch := self._queue.get()) is not None:
+        last = False
+        while not last:
+            batch, last = self._collect()
+            for start in range(0, max(len(batch.metrics), bool(batch.tags)), _MAX_METRICS):
+                try:
+                    metrics = batch.metrics[start : start + _MAX_METRICS]
+                    self._client.log_batch(self._run_id, metrics=metrics, tags=batch.tags if start == 0 else [])
+                except Exception as error:
+                    self._error = error
+
+    def _collect(self) -> tuple[_Batch, bool]:
+        """All that is dumped within an interval, and whether a flush is waiting for it.
+
+        A fast training dumps many times a second, and each call of MLflow costs tens of milliseconds of Python, which
+        the training would wait for.
+        """
+        whole, tags = _Batch([], []), {}
+        until = time.monotonic() + _INTERVAL_S
+        batch = self._queue.get()
+        while batch is not None:
+            whole.metrics.extend(batch.metrics)
+            tags |= {tag.key: tag for tag in batch.tags}
             try:
-                self._client.log_batch(self._run_id, metrics=batch.metrics, tags=batch.tags)
-            except Exception as error:
-                self._error = error
+                batch = self._queue.get(timeout=max(until - time.monotonic(), 0.001))
+            except Empty:
+                break
+        whole.tags.extend(tags.values())
+        return whole, batch is None
 
     def _warn_once(self, key: str, text: str) -> None:
         if key not in self._warned:
