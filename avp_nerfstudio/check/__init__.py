@@ -1,0 +1,1 @@
+"""Checks that the poses, intrinsics and depth of a rollout belong together."""
