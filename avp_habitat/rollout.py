@@ -1,20 +1,21 @@
 """Reading a rollout folder, with every fault of it named.
 
 The folder is the contract between the halves of the suite (capturing and reconstructing); `rollout_writer` makes it.
-Nothing is decoded here: pictures are checked by their PNG headers, so that thousands of frames cost a second.
+Nothing is decoded here: pictures are checked by their first and last bytes, so that thousands of frames cost a second.
 """
 
 import json
 import os
-import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.errors import RolloutError
+from avp_habitat.png import GREY_16, RGB_8, check_png_structure
 from avp_habitat.poses import Intrinsics, rigidity_fault
 
 FORMAT = "avp-rollout"
@@ -24,8 +25,11 @@ POSE_CONVENTION = (
     "camera axes habitat (= OpenGL): x right, y up, looks along -z"
 )
 HELDOUT = "heldout"
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_RGB_8, _GRAY_16 = (8, 2), (16, 0)
+# A pose that is rigid within this is so within the tolerance of `rigidity_fault`, which decides on all others.
+_CLEARLY_RIGID = 5e-5
+# Of 16 numbers, written with all their digits; a pose file longer than this is none.
+_LONGEST_POSE_BYTES = 4096
+_MANY_PIXELS = 1e9
 
 
 @dataclass(frozen=True)
@@ -113,7 +117,7 @@ def read_json(path: Path) -> dict[str, Any]:
         value = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise RolloutError(f"{path}: expected this file of the rollout, found none") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise RolloutError(f"{path}: expected JSON, could not read it: {error}") from None
     if not isinstance(value, dict):
         raise RolloutError(f"{path}: expected a JSON object, found a {type(value).__name__}")
@@ -126,19 +130,44 @@ def read_pose(path: Path) -> NDArray[np.float64]:
     Raises:
         RolloutError: it is missing, not 16 numbers, or not a rigid transform.
     """
+    return read_poses([str(path)])[0]
+
+
+def read_poses(paths: Sequence[str]) -> NDArray[np.float64]:
+    """`(n, 4, 4)` camera_to_world of text files, checked to be rigid.
+
+    Raises:
+        RolloutError: one is missing, not 16 numbers, or not a rigid transform; the first such file is named.
+    """
+    poses = np.array([_pose_numbers(path) for path in paths]).reshape(-1, 4, 4)
+    for index in np.flatnonzero(~_clearly_rigid(poses)):
+        if fault := rigidity_fault(poses[index]):
+            raise RolloutError(f"{paths[index]}: not a rigid camera_to_world: {fault}")
+    return poses
+
+
+def _pose_numbers(path: str) -> list[float]:
     try:
-        pose = np.array([float(word) for word in path.read_text(encoding="ascii").split()])
+        with open(path, "rb", buffering=0) as file:
+            numbers = [float(word) for word in file.read(_LONGEST_POSE_BYTES).split()]
     except FileNotFoundError:
         raise RolloutError(f"{path}: expected this pose file, found none") from None
     except (OSError, ValueError) as error:
         raise RolloutError(f"{path}: expected 4 rows of 4 numbers, could not read them: {error}") from None
-    if pose.size != 16:
-        raise RolloutError(f"{path}: expected 4 rows of 4 numbers, found {pose.size} numbers")
-    pose = pose.reshape(4, 4)
-    fault = rigidity_fault(pose)
-    if fault:
-        raise RolloutError(f"{path}: not a rigid camera_to_world: {fault}")
-    return pose
+    if len(numbers) != 16:
+        raise RolloutError(f"{path}: expected 4 rows of 4 numbers, found {len(numbers)} numbers")
+    return numbers
+
+
+def _clearly_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """`(n,)` whether each of `(n, 4, 4)` is beyond doubt; one call for thousands."""
+    rotations = poses[:, :3, :3]
+    with np.errstate(all="ignore"):
+        skew = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0)
+        last_row = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1, initial=0)
+        turned = np.linalg.det(rotations) > 0
+        finite = np.isfinite(poses).all(axis=(1, 2))
+    return finite & turned & (np.maximum(skew, last_row) < _CLEARLY_RIGID)
 
 
 def _of(meta: dict[str, Any], key: str) -> dict[str, Any]:
@@ -156,33 +185,32 @@ def _count(folder: Path, meta: dict[str, Any], key: str) -> int:
 def _intrinsics(path: Path, meta: dict[str, Any]) -> Intrinsics:
     camera = _of(meta, "camera")
     values: dict[str, Any] = {}
-    value: Any
     for name, kind in (("width", int), ("height", int), ("fx", float), ("fy", float), ("cx", float), ("cy", float)):
         value = camera.get(name)
-        usable = isinstance(value, (int, float)) and not isinstance(value, bool) and np.isfinite(value) and value > 0
-        if not usable or (kind is int and value != int(value)):
+        if not _is_number_of_pixels(value) or (kind is int and value % 1):
             expected = "a whole number of pixels" if kind is int else "a number of pixels"
             raise RolloutError(f"{path}: expected camera.{name} to be {expected} above 0, found {value!r}")
         values[name] = kind(value)
     return Intrinsics(**values)
 
 
+def _is_number_of_pixels(value: Any) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < _MANY_PIXELS
+
+
 def _read_views(root: Path, base: Path, count: int, intrinsics: Intrinsics) -> list[View]:
+    if not count:
+        return []
     for kind, suffix in (("images", ".png"), ("depth", ".png"), ("poses", ".txt")):
-        if count:
-            _check_listing(root, base / kind, suffix, count)
-    views = []
-    for index in range(count):
-        stem = frame_name(index)
-        view = View(
-            base / "images" / f"{stem}.png",
-            base / "depth" / f"{stem}.png",
-            read_pose(base / "poses" / f"{stem}.txt"),
-        )
-        _check_png(view.image, intrinsics, _RGB_8, "8-bit RGB")
-        _check_png(view.depth, intrinsics, _GRAY_16, "16-bit grey")
-        views.append(view)
-    return views
+        _check_listing(root, base / kind, suffix, count)
+    stems = [frame_name(index) for index in range(count)]
+    poses = read_poses([f"{base}/poses/{stem}.txt" for stem in stems])
+    size = {"width": intrinsics.width, "height": intrinsics.height}
+    for stem in stems:
+        check_png_structure(f"{base}/images/{stem}.png", **size, kind=RGB_8)
+        check_png_structure(f"{base}/depth/{stem}.png", **size, kind=GREY_16)
+    images, depths = base / "images", base / "depth"
+    return [View(images / f"{stem}.png", depths / f"{stem}.png", pose) for stem, pose in zip(stems, poses, strict=True)]
 
 
 def _check_listing(root: Path, folder: Path, suffix: str, count: int) -> None:
@@ -190,37 +218,29 @@ def _check_listing(root: Path, folder: Path, suffix: str, count: int) -> None:
     _check_inside(root, folder)
     try:
         with os.scandir(folder) as entries:
-            found = {entry.name: entry.is_symlink() for entry in entries}
+            plain = {
+                entry.name: entry.is_file(follow_symlinks=False) for entry in entries if entry.name.endswith(suffix)
+            }
     except OSError as error:
         raise RolloutError(f"{folder}: expected {count} files, could not list it: {error.strerror}") from None
-    expected = {frame_name(index) + suffix for index in range(count)}
-    if missing := sorted(expected - found.keys()):
-        raise RolloutError(f"{folder / missing[0]}: expected this file ({count} frames by rollout.json), found none")
-    if extra := sorted(name for name in found.keys() - expected if name.endswith(suffix)):
+    # The count may be anything: the search ends at the first name that is not there.
+    expected: set[str] = set()
+    for index in range(count):
+        if (name := frame_name(index) + suffix) not in plain:
+            raise RolloutError(f"{folder / name}: expected this file ({count} frames by rollout.json), found none")
+        expected.add(name)
+    if extra := sorted(plain.keys() - expected):
         raise RolloutError(f"{folder / extra[0]}: a frame that rollout.json does not count ({count} frames)")
-    for name in sorted(name for name, link in found.items() if link and name in expected):
+    for name in sorted(name for name, file in plain.items() if not file):
         _check_inside(root, folder / name)
+        if not (folder / name).is_file():
+            raise RolloutError(f"{folder / name}: expected a file, found something else (a folder, a broken link, …)")
 
 
 def _check_inside(root: Path, path: Path) -> None:
-    if not path.resolve().is_relative_to(root.resolve()):
-        raise RolloutError(f"{path}: expected a path inside {root}, it leads to {path.resolve()}")
-
-
-def _check_png(path: Path, intrinsics: Intrinsics, kind: tuple[int, int], wanted: str) -> None:
     try:
-        with path.open("rb") as file:
-            header = file.read(26)
-    except OSError as error:
-        raise RolloutError(f"{path}: expected a {wanted} PNG, could not read it: {error.strerror}") from None
-    if len(header) < 26 or header[:8] != _PNG_SIGNATURE:
-        raise RolloutError(
-            f"{path}: expected a {wanted} PNG, found {'an empty file' if not header else 'something else'}"
-        )
-    width, height, bits, colour = struct.unpack(">IIBB", header[16:26])
-    if (width, height) != (intrinsics.width, intrinsics.height):
-        raise RolloutError(
-            f"{path}: expected {intrinsics.width}x{intrinsics.height} pixels (rollout.json), found {width}x{height}"
-        )
-    if (bits, colour) != kind:
-        raise RolloutError(f"{path}: expected a {wanted} PNG, found {bits} bits with PNG colour type {colour}")
+        leads_to = path.resolve()
+    except (OSError, RuntimeError):
+        raise RolloutError(f"{path}: expected a path inside {root}, found a link that leads to itself") from None
+    if not leads_to.is_relative_to(root.resolve()):
+        raise RolloutError(f"{path}: expected a path inside {root}, it leads to {leads_to}")

@@ -7,6 +7,7 @@ from PIL import Image
 
 from avp_habitat import images, poses
 from avp_habitat.errors import RolloutError, UsageError
+from avp_habitat.png import check_png_contents
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout import read_rollout
 from avp_habitat.rollout_writer import RolloutWriter
@@ -141,6 +142,21 @@ def link_out(folder, name):
     (folder / name).symlink_to(outside)
 
 
+def cut_short(folder, name):
+    path = folder / name
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def link_to_itself(folder, name):
+    (folder / name).unlink()
+    (folder / name).symlink_to(folder / name)
+
+
+def replace_by_folder(folder, name):
+    (folder / name).unlink()
+    (folder / name).mkdir()
+
+
 DAMAGES = {
     "no folder": (shutil.rmtree, "expected a rollout folder"),
     "no rollout.json": (lambda f: (f / "rollout.json").unlink(), "rollout.json: expected this file"),
@@ -183,10 +199,73 @@ DAMAGES = {
         lambda f: (f / "poses/frame_00001.txt").write_text("one " * 16),
         "expected 4 rows of 4 numbers",
     ),
+    "turned by a scale": (
+        lambda f: np.savetxt(f / "poses/frame_00002.txt", np.diag([1.001, 1, 1, 1])),
+        "frame_00002.txt: not a rigid camera_to_world: .*not orthonormal",
+    ),
+    "a pose longer than any": (
+        lambda f: (f / "poses/frame_00001.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1" + " 0" * 4000),
+        "expected 4 rows of 4 numbers",
+    ),
+    "count beyond all files": (
+        lambda f: edit_json(f / "rollout.json", lambda j: j["counts"].update(frames=10**12)),
+        "frame_00003.png: expected this file",
+    ),
+    "a size beyond all numbers": (
+        lambda f: edit_json(f / "rollout.json", lambda j: j["camera"].update(fx=10**400)),
+        "camera.fx to be a number of pixels",
+    ),
+    "nested without end": (lambda f: (f / "rollout.json").write_text("[" * 100_000), "rollout.json: expected JSON"),
+    "image cut short": (lambda f: cut_short(f, "images/frame_00002.png"), "frame_00002.png: .* without an end"),
+    "depth cut short": (lambda f: cut_short(f, "heldout/depth/frame_00001.png"), "frame_00001.png: .* without an end"),
+    "image is a folder": (lambda f: replace_by_folder(f, "images/frame_00001.png"), "frame_00001.png: expected a file"),
+    "image leads to itself": (lambda f: link_to_itself(f, "images/frame_00001.png"), "link that leads to itself"),
     "image outside": (lambda f: link_out(f, "images/frame_00001.png"), "expected a path inside"),
     "pose outside": (lambda f: link_out(f, "poses/frame_00000.txt"), "expected a path inside"),
     "rollout.json outside": (lambda f: link_out(f, "rollout.json"), "expected a path inside"),
 }
+
+
+def test_a_pose_written_with_few_digits_is_still_rigid(rollout):
+    """Between the quick test for thousands of poses and the tolerance, the exact test decides."""
+    path = rollout / "poses/frame_00001.txt"
+    np.savetxt(path, np.loadtxt(path).round(4), fmt="%.4f")
+    written = np.loadtxt(path)
+    assert 5e-5 < np.abs(written[:3, :3] @ written[:3, :3].T - np.eye(3)).max() < 1e-4
+    np.testing.assert_array_equal(read_rollout(rollout).frames[1].camera_to_world, written)
+
+
+def test_the_first_of_several_bad_poses_is_named(rollout):
+    for index in (2, 1):
+        np.savetxt(rollout / f"poses/frame_0000{index}.txt", np.diag([2.0, 1, 1, 1]))
+    with pytest.raises(RolloutError, match=r"poses/frame_00001\.txt: not a rigid"):
+        read_rollout(rollout)
+
+
+def test_links_within_the_folder_are_followed(rollout):
+    (rollout / "images/frame_00001.png").unlink()
+    (rollout / "images/frame_00001.png").symlink_to(rollout / "images/frame_00000.png")
+    assert len(read_rollout(rollout).frames) == FRAMES
+
+
+@pytest.mark.parametrize("position", [20, 60, -20])
+def test_any_damaged_byte_of_a_picture_is_found_by_its_checksums(rollout, position):
+    path = rollout / "images/frame_00000.png"
+    check_png_contents(path)
+    content = bytearray(path.read_bytes())
+    content[position] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(RolloutError, match=r"frame_00000\.png: expected .* (IHDR|IDAT) .*does not match its checksum"):
+        check_png_contents(path)
+
+
+def test_a_chunk_longer_than_the_file_is_found(rollout):
+    path = rollout / "images/frame_00000.png"
+    content = bytearray(path.read_bytes())
+    content[33] = 0x7F
+    path.write_bytes(content)
+    with pytest.raises(RolloutError, match="part at byte 33 is longer than the file"):
+        check_png_contents(path)
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
