@@ -1,9 +1,11 @@
 """The dataparser `avp-data`: a rollout folder becomes nerfstudio's cameras, in metres."""
 
+import functools
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -13,14 +15,15 @@ from nerfstudio.data.scene_box import SceneBox
 from numpy.typing import NDArray
 
 from avp_habitat.errors import RolloutError
-from avp_habitat.images import DEPTH_UNIT_M, read_depth
-from avp_habitat.poses import Intrinsics, unproject, y_up_to_z_up
-from avp_habitat.rollout import Rollout, View, read_rollout
+from avp_habitat.images import DEPTH_UNIT_M
+from avp_habitat.poses import Intrinsics, y_up_to_z_up
+from avp_habitat.rollout import Rollout, View
+from avp_nerfstudio.merging import read_merged
+from avp_nerfstudio.seen_points import SeenPoints, scene_box, seen_points, subset
+from avp_nerfstudio.selection import Order, chosen_views
+from avp_nerfstudio.verification import verify_pictures
 
-_DEPTHS_FOR_BOX = 24
-_PIXEL_STRIDE = 8
-_BOX_PERCENTILES = (0.2, 99.8)
-_BOX_MARGIN_M = 0.1
+SPLITS = ("train", "val", "test")
 
 
 class UnusableRolloutError(RolloutError, SystemExit):
@@ -42,14 +45,47 @@ class AVPDataParserConfig(DataParserConfig):
 
     _target: type = field(default_factory=lambda: AVPDataParser)
     data: Path = Path()
-    """The rollout: its folder, or its rollout.json."""
+    """The rollout: its folder, or its rollout.json. Its captured frames are for training, its held-out views for
+    evaluation."""
+    also: tuple[Path, ...] = ()
+    """More rollouts of the same scene and camera, whose frames are trained with too. The held-out views are those of
+    --data: they follow from the scene, so all hold the same."""
     scale: float = 1.0
-    """Multiplies all positions; 1 keeps metres. It is written to dataparser_transforms.json, so that nerfstudio's
-    exports and poses can be brought back to metres."""
+    """Multiplies all positions, depths and the scene box; 1 keeps metres. It is written to
+    dataparser_transforms.json, so that nerfstudio's exports and poses can be brought back to metres."""
     every: int = 1
     """Train with every n-th captured frame only."""
     max_views: int = 0
     """Train with the first n of these frames only; 0 for all."""
+    order: Order = "steps"
+    """Which frames --max-views takes first: `steps` as they were captured (of several rollouts one after another);
+    `spread` always the one farthest in place and viewing direction from those taken; `random`, the same every time."""
+    depth: bool = True
+    """Give the rollout's depth to methods that use it (depth-nerfacto, avp-nerfacto, splatfacto's initial points).
+    False makes the reconstruction one from colours alone; only the scene box still comes from depth. The depth is
+    along the camera's axis, not along the ray: leave depth-nerfacto's is_euclidean_depth at False."""
+    initial_points: int = 50_000
+    """Give splatfacto at most so many coloured points to begin with, from the depth of at most 24 of the frames; 0
+    for none. Other methods ignore them."""
+    box_margin_m: float = 0.1
+    """The scene box is the box around the frames' cameras and what their depth shows (without the farthest 0.2 % on
+    each side; a rollout says how large the navigable area is, not where it lies), and so many metres more on every
+    side."""
+    verify: bool | None = None
+    """Hold every byte of the pictures to its checksum before training; None does so when they have at most 1 GiB
+    (about a second). That every picture is there, whole and of the right size is always checked."""
+
+
+@dataclass(frozen=True)
+class _Parsed:
+    """What all splits of one parser share."""
+
+    rollout: Rollout
+    """As read, with the frames of those merged into it."""
+    frames: list[View]
+    """To train with."""
+    seen: SeenPoints
+    """By these frames; in metres."""
 
 
 @dataclass
@@ -64,33 +100,41 @@ class AVPDataParser(DataParser):
         except RolloutError as error:
             raise UnusableRolloutError(str(error)) from None
 
+    @functools.cached_property
+    def _parsed(self) -> _Parsed:
+        config = self.config
+        _check_options(config)
+        rollout = read_merged(config.data, config.also)
+        frames = chosen_views(rollout.frames, every=config.every, max_views=config.max_views, order=config.order)
+        if not frames:
+            raise RolloutError(f"{rollout.folder}: expected at least one captured frame, found none")
+        verify_pictures([*frames, *rollout.heldout], wanted=config.verify)
+        return _Parsed(rollout, frames, seen_points(frames, rollout.intrinsics, colours=self._gives_points))
+
+    @property
+    def _gives_points(self) -> bool:
+        return self.config.depth and self.config.initial_points > 0
+
     def _outputs(self, split: str) -> DataparserOutputs:
-        _check_options(self.config)
-        rollout = read_rollout(self.config.data)
-        frames = captured(rollout, every=self.config.every, max_views=self.config.max_views)
-        views = frames if split == "train" else rollout.heldout
+        if split not in SPLITS:
+            raise RolloutError(f"avp-data: unknown split {split!r}: expected one of {', '.join(SPLITS)}")
+        parsed, scale = self._parsed, self.config.scale
+        views = parsed.frames if split == "train" else parsed.rollout.heldout
         if not views:
-            raise RolloutError(f"{rollout.folder}: expected at least one view for the {split} split, found none")
-        poses = nerfstudio_poses([view.camera_to_world for view in views], scale=self.config.scale)
-        box = scene_box(frames, rollout.intrinsics) * self.config.scale
+            raise RolloutError(_no_heldout_views(parsed.rollout, split))
+        poses = nerfstudio_poses([view.camera_to_world for view in views], scale=scale)
+        box = scene_box(parsed.frames, parsed.seen, margin_m=self.config.box_margin_m) * scale
+        metadata = _depth_metadata(views) if self.config.depth else {}
+        if split == "train" and self._gives_points:
+            metadata |= _point_metadata(subset(parsed.seen, self.config.initial_points), scale)
         return DataparserOutputs(
             image_filenames=[view.image for view in views],
-            cameras=_cameras(poses, rollout.intrinsics),
+            cameras=_cameras(poses, parsed.rollout.intrinsics),
             scene_box=SceneBox(aabb=torch.from_numpy(box.astype(np.float32))),
-            metadata={
-                "depth_filenames": [view.depth for view in views],
-                # nerfstudio multiplies it by dataparser_scale itself, where it reads depth.
-                "depth_unit_scale_factor": DEPTH_UNIT_M,
-            },
+            metadata=metadata,
             dataparser_transform=torch.from_numpy(y_up_to_z_up(np.eye(4))[:3].astype(np.float32)),
-            dataparser_scale=self.config.scale,
+            dataparser_scale=scale,
         )
-
-
-def captured(rollout: Rollout, *, every: int = 1, max_views: int = 0) -> list[View]:
-    """The captured frames to train with: every n-th, at most `max_views` of them (0 for all)."""
-    frames = rollout.frames[::every]
-    return frames[:max_views] if max_views else frames
 
 
 def nerfstudio_poses(poses: Sequence[NDArray[np.floating]], *, scale: float) -> NDArray[np.float32]:
@@ -108,34 +152,22 @@ def nerfstudio_poses(poses: Sequence[NDArray[np.floating]], *, scale: float) -> 
     return turned.astype(np.float32)
 
 
-def scene_box(views: Sequence[View], intrinsics: Intrinsics) -> NDArray[np.float64]:
-    """The box that holds the cameras and what they saw, from a few pixels of a few depth images.
-
-    Far outliers (a glimpse through a window) do not stretch it.
-
-    Returns:
-        `(2, 3)` least and greatest corner, Z up, metres.
-
-    Raises:
-        RolloutError: a depth image cannot be decoded.
-    """
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _DEPTHS_FOR_BOX)).round().astype(int))
-    seen = np.concatenate([_seen_points(views[index], intrinsics) for index in chosen])
-    cameras = np.stack([view.camera_to_world[:3, 3] for view in views])
-    inner = np.percentile(seen, _BOX_PERCENTILES, axis=0) if len(seen) else cameras[:2]
-    points = np.concatenate([inner, cameras])
-    points = (y_up_to_z_up(np.eye(4))[:3, :3] @ points.T).T
-    return np.stack([points.min(axis=0) - _BOX_MARGIN_M, points.max(axis=0) + _BOX_MARGIN_M])
+def _depth_metadata(views: Sequence[View]) -> dict[str, Any]:
+    return {
+        "depth_filenames": [view.depth for view in views],
+        # nerfstudio multiplies it by dataparser_scale itself, where it reads depth.
+        "depth_unit_scale_factor": DEPTH_UNIT_M,
+    }
 
 
-def _seen_points(view: View, intrinsics: Intrinsics) -> NDArray[np.floating]:
-    try:
-        depth = read_depth(view.depth)
-    except (OSError, ValueError, SyntaxError) as error:
-        raise RolloutError(f"{view.depth}: expected a readable PNG, could not decode it: {error}") from None
-    sparse = (slice(_PIXEL_STRIDE // 2, None, _PIXEL_STRIDE),) * 2
-    points = unproject(depth, view.camera_to_world, intrinsics)
-    return points[sparse][depth[sparse] > 0]
+def _point_metadata(points: SeenPoints, scale: float) -> dict[str, Any]:
+    """As nerfstudio's pipeline looks for them; a method that cannot use them is not given any."""
+    if not len(points.xyz):
+        return {}
+    return {
+        "points3D_xyz": torch.from_numpy(points.xyz * np.float32(scale)),
+        "points3D_rgb": torch.from_numpy(points.rgb),
+    }
 
 
 def _cameras(poses: NDArray[np.float32], intrinsics: Intrinsics) -> Cameras:
@@ -151,13 +183,32 @@ def _cameras(poses: NDArray[np.float32], intrinsics: Intrinsics) -> Cameras:
     )
 
 
+def _no_heldout_views(rollout: Rollout, split: str) -> str:
+    scene = rollout.meta.get("scene")
+    name = scene.get("name") if isinstance(scene, dict) else None
+    again = (
+        f"python -m avp_habitat.collect --scene {shlex.quote(str(name or 'SCENE'))} --policy POLICY --out NEW_FOLDER"
+    )
+    return (
+        f"{rollout.folder}: expected held-out views for the {split} split, found none; they are captured with the "
+        f"rollout and no command adds them to a folder: collect it again with `{again}`, which captures 20 of them"
+    )
+
+
 def _check_options(config: AVPDataParserConfig) -> None:
     if config.data == Path():
         raise RolloutError("avp-data: no rollout named; add --data with a rollout's folder")
-    if not (np.isfinite(config.scale) and config.scale > 0):
-        raise RolloutError(f"avp-data: expected --scale above 0, got {config.scale}")
-    if config.every < 1 or config.max_views < 0:
-        raise RolloutError(
-            f"avp-data: expected --every of at least 1 and --max-views of at least 0, "
-            f"got {config.every} and {config.max_views}"
-        )
+    for option, value, least, above in (
+        ("--scale", config.scale, 0, True),
+        ("--every", config.every, 1, False),
+        ("--max-views", config.max_views, 0, False),
+        ("--initial-points", config.initial_points, 0, False),
+        ("--box-margin-m", config.box_margin_m, 0, False),
+    ):
+        if not (np.isfinite(value) and (value > least if above else value >= least)):
+            raise RolloutError(
+                f"avp-data: expected {option} {'above' if above else 'of at least'} {least}, got {value}"
+            )
+    orders = get_args(Order)
+    if config.order not in orders:
+        raise RolloutError(f"avp-data: unknown --order {config.order!r}: expected one of {', '.join(orders)}")

@@ -1,14 +1,16 @@
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from nerfstudio_room import ROOM, distance_to_walls, random_poses, write_room
+from PIL import Image
 
 from avp_habitat.errors import RolloutError
-from avp_habitat.images import read_depth
-from avp_habitat.poses import project, z_up_to_y_up
+from avp_habitat.images import read_depth, read_rgb
+from avp_habitat.poses import camera_to_world, project, z_up_to_y_up
 from avp_habitat.rollout import read_rollout
 
 pytest.importorskip("nerfstudio")
@@ -16,7 +18,10 @@ pytest.importorskip("nerfstudio")
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.datasets.depth_dataset import DepthDataset
 
+from avp_nerfstudio import verification
 from avp_nerfstudio.dataparser import AVPDataParserConfig, UnusableRolloutError
+from avp_nerfstudio.seen_points import MOST_VIEWS
+from avp_nerfstudio.selection import spread_order
 
 Z_UP = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0]])
 
@@ -29,6 +34,26 @@ def room(tmp_path_factory):
 @pytest.fixture
 def broken(tmp_path):
     return write_room(tmp_path / "broken", frames=2, heldout=1)
+
+
+def edit(folder, change):
+    path = folder / "rollout.json"
+    meta = json.loads(path.read_text())
+    change(meta)
+    path.write_text(json.dumps(meta))
+
+
+def write_known_room(folder, *, scene="a" * 64, **options):
+    """A room whose rollout.json tells its scene, as collected ones do."""
+    write_room(folder, **options)
+    edit(folder, lambda meta: meta.update(scene={"name": f"room {scene[0]}", "sha256": scene}))
+    return folder
+
+
+@pytest.fixture
+def pair(tmp_path):
+    """Two rollouts of one scene."""
+    return write_known_room(tmp_path / "one", frames=3), write_known_room(tmp_path / "two", frames=4, heldout=3)
 
 
 def parse(folder, split="train", **options):
@@ -89,6 +114,123 @@ def test_a_subset_of_the_frames_can_be_asked_for(room):
     assert len(parse(room, "val", every=2, max_views=2).image_filenames) == 2
 
 
+@pytest.mark.parametrize("order", ["steps", "spread", "random"])
+def test_any_order_keeps_as_many_different_frames_as_asked_for(room, order):
+    names = [path.name for path in parse(room, max_views=4, order=order).image_filenames]
+    assert len(names) == len(set(names)) == 4
+    assert [path.name for path in parse(room, order=order).image_filenames] == sorted(
+        path.name for path in (room / "images").iterdir()
+    )
+    assert names == [path.name for path in parse(room, max_views=4, order=order).image_filenames]
+    assert names[0] == "frame_00000.png" or order == "random"
+    assert names != sorted(path.name for path in (room / "images").iterdir())[:4] or order == "steps"
+
+
+def test_poses_and_depth_stay_with_their_picture_in_any_order(room):
+    outputs = parse(room, max_views=4, order="random")
+    every = parse(room)
+    for index, path in enumerate(outputs.image_filenames):
+        same = every.image_filenames.index(path)
+        assert torch.equal(outputs.cameras.camera_to_worlds[index], every.cameras.camera_to_worlds[same])
+        assert outputs.metadata["depth_filenames"][index] == every.metadata["depth_filenames"][same]
+
+
+def test_spread_views_go_far_first_then_look_elsewhere():
+    x = np.array([0.0, 0.1, 5.0, 5.1, 2.5, 0.0])
+    poses = camera_to_world(np.stack([x, x * 0, x * 0], 1), yaw=np.array([0, 0, 0, 0, 0, np.pi]), pitch=x * 0)
+    assert spread_order(poses, 4).tolist() == [0, 3, 4, 5]
+    assert sorted(spread_order(poses, 6)) == list(range(6))
+    assert sorted(spread_order(np.repeat(poses[:1], 5, axis=0), 5)) == list(range(5))
+
+
+def test_merged_rollouts_train_with_all_frames_and_evaluate_on_the_first_ones_heldout_views(pair):
+    one, two = pair
+    train, val = (parse(one, split, also=(two / "rollout.json",)) for split in ("train", "val"))
+    folders = [path.parent.parent for path in train.image_filenames]
+    assert folders == [one] * 3 + [two] * 4
+    assert {path.parent.parent for path in train.metadata["depth_filenames"]} == {one, two}
+    assert [path.relative_to(one).parts[0] for path in val.image_filenames] == ["heldout"] * 2
+    alone = parse(two).cameras.camera_to_worlds
+    assert torch.equal(train.cameras.camera_to_worlds[3:], alone)
+    low, high = train.scene_box.aabb
+    assert ((alone[:, :, 3] > low) & (alone[:, :, 3] < high)).all()
+
+
+def test_rollouts_of_different_scenes_are_not_merged(pair, tmp_path):
+    other = write_known_room(tmp_path / "other", scene="b" * 64, frames=1)
+    text = (
+        r"other: captured in the scene 'room b' \(sha256 bbb.*one in 'room a' \(sha256 aaa.*only rollouts of one scene"
+    )
+    with pytest.raises(RolloutError, match=text):
+        parse(pair[0], also=(pair[1], other))
+    edit(other, lambda meta: meta.update(scene=None))
+    with pytest.raises(RolloutError, match=r"rollout\.json: expected scene\.sha256"):
+        parse(pair[0], also=(other,))
+
+
+def test_rollouts_of_different_cameras_are_not_merged(pair, tmp_path):
+    wide = write_known_room(tmp_path / "wide", frames=1, width=40)
+    text = r"wide/rollout\.json: pictures of 40x24 .*one/rollout\.json has 32x24 .*--width 32 --height 24"
+    with pytest.raises(RolloutError, match=text):
+        parse(pair[0], also=(wide,))
+    edit(pair[1], lambda meta: meta["camera"].update(fx=meta["camera"]["fx"] * 1.03))
+    with pytest.raises(RolloutError, match=r"focal lengths 17\.1392, .* focal lengths 16\.64,"):
+        parse(pair[0], also=(pair[1],))
+
+
+def test_a_rollout_named_twice_is_refused(pair, tmp_path):
+    (tmp_path / "link").symlink_to(pair[0])
+    with pytest.raises(RolloutError, match=r"link: expected each rollout once, .*\(it is .*one\)"):
+        parse(pair[0], also=(pair[1], tmp_path / "link"))
+
+
+def test_a_fault_of_a_merged_rollout_names_its_file(pair):
+    (pair[1] / "poses/frame_00003.txt").unlink()
+    with pytest.raises(RolloutError, match=r"two/poses/frame_00003\.txt: expected this file"):
+        parse(pair[0], also=(pair[1],))
+
+
+def test_without_depth_methods_see_neither_depth_nor_points_but_the_same_box(room):
+    colours, everything = parse(room, depth=False), parse(room)
+    assert colours.metadata == {}
+    assert torch.equal(colours.scene_box.aabb, everything.scene_box.aabb)
+    assert parse(room, "val", depth=False).metadata == {}
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_initial_points_lie_on_the_walls_in_their_colours(room, scale):
+    metadata = parse(room, scale=scale, initial_points=300).metadata
+    points, colours = metadata["points3D_xyz"], metadata["points3D_rgb"]
+    assert (points.dtype, colours.dtype) == (torch.float32, torch.uint8)
+    assert points.shape == colours.shape == (300, 3)
+    points = to_y_up(points.numpy() / scale)
+    assert distance_to_walls(points).max() < 0.005
+    view = read_rollout(room).frames[0]
+    pixels, depth = project(points, view.camera_to_world[None], read_rollout(room).intrinsics)
+    column, row = np.floor(pixels[0]).astype(int).T
+    inside = (depth[0] > 0) & (column >= 0) & (column < 32) & (row >= 0) & (row < 24)
+    assert inside.sum() > 20
+    found = read_rgb(view.image)[row[inside], column[inside]].astype(int)
+    # A convex room hides nothing, so each point seen here has the colour of its pixel, nearly.
+    assert np.median(np.abs(found - colours.numpy()[inside])) <= 4
+
+
+def test_initial_points_are_for_training_only_can_be_left_out_and_are_the_same_every_time(room):
+    assert "points3D_xyz" not in parse(room, "val").metadata
+    assert "points3D_xyz" not in parse(room, initial_points=0).metadata
+    assert torch.equal(parse(room).metadata["points3D_xyz"], parse(room).metadata["points3D_xyz"])
+
+
+def test_a_rollout_that_saw_nothing_has_no_points_and_its_cameras_in_the_box(broken):
+    for view in read_rollout(broken).frames:
+        Image.fromarray(np.zeros((24, 32), np.uint16)).save(view.depth)
+    outputs = parse(broken)
+    assert "points3D_xyz" not in outputs.metadata
+    positions = outputs.cameras.camera_to_worlds[:, :, 3]
+    expected = torch.stack([positions.amin(0) - 0.1, positions.amax(0) + 0.1])
+    torch.testing.assert_close(outputs.scene_box.aabb, expected)
+
+
 def test_the_scene_box_is_the_room_with_its_cameras(room):
     low, high = parse(room).scene_box.aabb.numpy()
     turned = ROOM @ Z_UP[:, :3].numpy().T
@@ -97,6 +239,12 @@ def test_the_scene_box_is_the_room_with_its_cameras(room):
     cameras = parse(room, "val").cameras.camera_to_worlds[:, :, 3].numpy()
     assert ((cameras > low) & (cameras < high)).all()
     np.testing.assert_allclose(parse(room, scale=0.5).scene_box.aabb, np.stack([low, high]) / 2, atol=1e-6)
+
+
+def test_the_margin_of_the_scene_box_can_be_chosen(room):
+    low, high = parse(room, box_margin_m=0.0).scene_box.aabb
+    wide = parse(room, box_margin_m=0.5, scale=2.0).scene_box.aabb
+    torch.testing.assert_close(wide, 2 * torch.stack([low - 0.5, high + 0.5]))
 
 
 def test_nerfstudio_reads_depth_in_the_units_of_the_poses(room):
@@ -140,30 +288,93 @@ def test_a_damaged_rollout_is_an_error_that_names_the_file(broken, path, content
         parse(broken)
 
 
-def test_a_depth_picture_cut_short_is_an_error_that_names_the_file(broken):
-    path = broken / "depth/frame_00000.png"
-    path.write_bytes(path.read_bytes()[:-60])
-    with pytest.raises(RolloutError, match=r"frame_00000\.png: expected a readable PNG"):
+def damage(path):
+    """Change one bit in the middle of a picture, which neither its first nor its last bytes show."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("path", ["images/frame_00001.png", "depth/frame_00000.png", "heldout/images/frame_00000.png"])
+def test_a_damaged_picture_is_named_before_training(broken, path):
+    damage(broken / path)
+    with pytest.raises(RolloutError, match=f"{path}: expected an undamaged PNG"):
         parse(broken)
 
 
-def test_a_rollout_without_heldout_views_cannot_be_evaluated(broken):
+def test_many_pictures_are_checked_byte_by_byte_only_when_asked_for(broken, monkeypatch):
+    # A held-out picture, because a few of the captured ones are decoded while parsing.
+    damage(broken / "heldout/images/frame_00000.png")
+    monkeypatch.setattr(verification, "AUTOMATIC_BYTES", 1000)
+    parse(broken)
+    with pytest.raises(RolloutError, match="expected an undamaged PNG"):
+        parse(broken, verify=True)
+    monkeypatch.setattr(verification, "AUTOMATIC_BYTES", 1_000_000)
+    parse(broken, verify=False)
+
+
+def test_pictures_that_are_not_used_are_not_checked_byte_by_byte(broken):
+    damage(broken / "images/frame_00001.png")
+    assert len(parse(broken, max_views=1).image_filenames) == 1
+
+
+def test_a_picture_that_cannot_be_decoded_is_named(broken):
+    damage(broken / "depth/frame_00000.png")
+    with pytest.raises(RolloutError, match=r"depth/frame_00000\.png: expected a readable PNG, could not decode it"):
+        parse(broken, verify=False)
+
+
+def test_of_a_long_rollout_few_pictures_are_decoded_and_it_is_read_once_for_all_splits(tmp_path, monkeypatch):
+    folder = write_room(tmp_path / "long", width=8, height=6, frames=3 * MOST_VIEWS)
+    opened = []
+    monkeypatch.setattr(Image, "open", lambda path, real=Image.open: opened.append(path) or real(path))
+    parser = AVPDataParserConfig(data=folder).setup()
+    train = parser.get_dataparser_outputs("train")
+    assert len(opened) == len(set(opened)) == 2 * MOST_VIEWS
+    shutil.rmtree(folder)
+    assert len(parser.get_dataparser_outputs("val").image_filenames) == 2
+    assert len(train.image_filenames) == 3 * MOST_VIEWS
+    assert len(opened) == 2 * MOST_VIEWS
+
+
+def test_a_rollout_without_heldout_views_says_how_to_get_them(broken):
     for kind in ("images", "depth", "poses"):
         for file in (broken / "heldout" / kind).iterdir():
             file.unlink()
-    meta = json.loads((broken / "rollout.json").read_text())
-    meta["counts"]["heldout"] = 0
-    (broken / "rollout.json").write_text(json.dumps(meta))
+    edit(broken, lambda meta: meta["counts"].update(heldout=0))
+    edit(broken, lambda meta: meta.update(scene={"name": "a room.glb"}))
     assert parse(broken).image_filenames
-    with pytest.raises(RolloutError, match="at least one view for the val split"):
+    text = (
+        r"no command adds them .* collect it again with `python -m avp_habitat\.collect --scene 'a room\.glb' --policy"
+    )
+    with pytest.raises(RolloutError, match=f"expected held-out views for the val split, found none.*{text}"):
         parse(broken, "val")
+
+
+def test_an_unknown_split_is_refused(room):
+    with pytest.raises(RolloutError, match="unknown split 'trian': expected one of train, val, test"):
+        parse(room, "trian")
+
+
+def test_a_rollout_without_frames_cannot_be_trained_on(broken):
+    for kind in ("images", "depth", "poses"):
+        for file in (broken / kind).iterdir():
+            file.unlink()
+    edit(broken, lambda meta: meta["counts"].update(frames=0))
+    with pytest.raises(RolloutError, match="expected at least one captured frame, found none"):
+        parse(broken)
 
 
 @pytest.mark.parametrize(
     ("options", "text"),
     [
         ({"scale": 0.0}, "expected --scale above 0"),
+        ({"scale": float("nan")}, "expected --scale above 0, got nan"),
         ({"every": 0}, "--every of at least 1"),
+        ({"max_views": -1}, "--max-views of at least 0, got -1"),
+        ({"initial_points": -1}, "--initial-points of at least 0"),
+        ({"box_margin_m": -0.1}, "--box-margin-m of at least 0"),
+        ({"order": "backwards"}, "unknown --order 'backwards': expected one of steps, spread, random"),
         ({"data": Path()}, "no rollout named; add --data"),
     ],
 )
