@@ -1,9 +1,32 @@
-"""What torch's safe loader must accept in nerfstudio's checkpoints, and nothing more."""
+"""What torch's safe loader must accept in nerfstudio's checkpoints, and how it refuses everything else."""
 
+import functools
+import os
+import pickle
+import re
+import sys
 from typing import Any
 
 import numpy as np
 import torch
+
+from avp_habitat.errors import AVPError
+
+_REFUSED = re.compile(r"GLOBAL (\S+) (?:was not an allowed global|whose module \S+ is blocked)")
+
+
+class UnsafeCheckpointError(AVPError, pickle.UnpicklingError, SystemExit):
+    """A checkpoint that holds something which could run code when it is loaded.
+
+    An ordinary `UnpicklingError`, as torch raises it, to whoever catches it; where nobody does (in `ns-eval`,
+    `ns-train --load-dir`, ...) the interpreter ends as on `sys.exit(text)`: the text on one line, exit code 1 and no
+    traceback.
+    """
+
+    def __init__(self, text: str) -> None:
+        """Remember the text as the interpreter's last words."""
+        super().__init__(text)
+        self.code = f"error: {text}"
 
 
 def checkpoint_types() -> list[Any]:
@@ -24,3 +47,35 @@ def allow_checkpoints() -> None:
     The safe loader stays on: any other type in a checkpoint is still refused.
     """
     torch.serialization.add_safe_globals(checkpoint_types())
+
+
+@functools.cache
+def refuse_in_one_line() -> None:
+    """Have a refused checkpoint end the `ns-` commands with one line that names the file and what is in it.
+
+    torch 2.15 raises an error of twenty lines that advises to switch its safe loader off, and nerfstudio 1.1.5 prints
+    it below a traceback. `torch.load` is called as before, with the caller's arguments; only its refusals, and only
+    when it is nerfstudio that calls, become an `UnsafeCheckpointError`.
+    """
+    load = torch.load
+
+    @functools.wraps(load)
+    def torch_load(f: Any, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return load(f, *args, **kwargs)
+        except pickle.UnpicklingError as error:
+            refused = _REFUSED.search(str(error))
+            caller = sys._getframe(1).f_globals.get("__name__", "")
+            if refused and caller.startswith("nerfstudio."):
+                raise UnsafeCheckpointError(_refusal(f, refused[1])) from error
+            raise
+
+    torch.load = torch_load
+
+
+def _refusal(file: Any, name: str) -> str:
+    path = os.fspath(file) if isinstance(file, str | os.PathLike) else getattr(file, "name", "the checkpoint")
+    return (
+        f"{path}: expected the tensors and numbers of a nerfstudio checkpoint, found {name}, which could run code "
+        "when it is loaded; refused"
+    )

@@ -40,10 +40,17 @@ def _nerfacto() -> Any:
     return avp_nerfacto()
 
 
-def _checkpoints() -> Any:
-    from avp_nerfstudio.checkpoints import allow_checkpoints
+def _checkpoints() -> None:
+    from avp_nerfstudio.checkpoints import allow_checkpoints, refuse_in_one_line
 
-    return allow_checkpoints()
+    allow_checkpoints()
+    refuse_in_one_line()
+
+
+def _videos() -> None:
+    from avp_nerfstudio.ffmpeg import offer_ffmpeg
+
+    offer_ffmpeg()
 
 
 _PLUGS: dict[str, tuple[str, Callable[[], Any]]] = {
@@ -78,3 +85,4 @@ def __getattr__(name: str) -> Any:
 
 
 _guarded("loading of checkpoints", _checkpoints)
+_guarded("writing of videos", _videos)
