@@ -1,0 +1,106 @@
+"""Exporting a rollout as a COLMAP model."""
+
+import os
+import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from avp_habitat.errors import RolloutError, UsageError
+from avp_habitat.rollout import Rollout
+from avp_nerfstudio.check.colmap_model import posed_model, triangulate
+from avp_nerfstudio.check.pictures_matching import Matches, match_pictures
+
+IMAGES = "images"
+# Where nerfstudio's `colmap` parser looks by default.
+SPARSE = Path("colmap") / "sparse" / "0"
+
+
+def export_colmap(
+    rollout: Rollout,
+    folder: str | Path,
+    *,
+    points: bool = True,
+    matches: Matches | None = None,
+    progress: bool = True,
+) -> Path:
+    """Write a rollout's frames as a COLMAP model, poses and camera as given.
+
+    The folder holds `images/` (hard links where the disk allows it, else copies) and `colmap/sparse/0/` (binary), as
+    `ns-train nerfacto colmap --data FOLDER` and `pycolmap.Reconstruction(FOLDER/colmap/sparse/0)` read them; image
+    i + 1 is frame i, named like the rollout's file. COLMAP prescribes no world axes, so the model keeps the
+    rollout's world: metres, Y up; mesh, rollout and model lie in one another. nerfstudio's parser turns it upright by
+    its default `--orientation-method up`; with `none` it takes -y for up, so also set
+    `--assume-colmap-world-coordinate-convention False` to keep the rollout's world there.
+
+    Args:
+        rollout: a checked rollout.
+        folder: must not exist; a failure or Ctrl-C leaves nothing behind.
+        points: triangulate points from the pictures, with tracks and colours. Without them, nerfstudio's parser needs
+            `--load-3D-points False`.
+        matches: of the rollout's pictures, where they are known already.
+        progress: show bars where the output is a terminal.
+
+    Returns:
+        The folder.
+
+    Raises:
+        UsageError: the folder exists.
+        RolloutError: a picture cannot be read, or the folder cannot be written.
+    """
+    folder = Path(folder)
+    if folder.exists() or folder.is_symlink():
+        raise UsageError(f"{folder}: exists already, expected a new folder for the COLMAP model")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.partial-") as scratch:
+            partial = Path(scratch) / folder.name
+            _write_images(rollout, partial / IMAGES)
+            if points and matches is None:
+                matches = match_pictures(rollout, workdir=Path(scratch), progress=progress)
+            _write_model(rollout, partial / SPARSE, matches if points else None)
+            partial.rename(folder)
+    except OSError as error:
+        raise RolloutError(f"{folder}: could not write the COLMAP model: {error.strerror or error}") from error
+    return folder
+
+
+def _write_images(rollout: Rollout, folder: Path) -> None:
+    folder.mkdir(parents=True)
+    for view in rollout.frames:
+        # A link in the rollout would be linked as such: resolve it, so that the export stands on its own.
+        source, target = view.image.resolve(), folder / view.image.name
+        try:
+            os.link(source, target)
+        except OSError:
+            shutil.copyfile(source, target)
+
+
+def _write_model(rollout: Rollout, folder: Path, matches: Matches | None) -> None:
+    folder.mkdir(parents=True)
+    poses = np.array([view.camera_to_world for view in rollout.frames]).reshape(-1, 4, 4)
+    if matches is None or not matches.pairs:
+        names = [view.image.name for view in rollout.frames]
+        model = posed_model(names, [np.empty((0, 2))] * len(names), poses, rollout.intrinsics)
+    else:
+        model = triangulate(_of_all_frames(matches, rollout), poses, rollout.intrinsics, workdir=folder)
+    model.write_binary(folder)
+
+
+def _of_all_frames(matches: Matches, rollout: Rollout) -> Matches:
+    """The same matches, among all frames of the rollout: those that were not matched have no features."""
+    features = [np.empty((0, 2))] * len(rollout.frames)
+    for place, frame in enumerate(matches.frames):
+        features[frame] = matches.features[place]
+    return replace(
+        matches,
+        names=[view.image.name for view in rollout.frames],
+        frames=np.arange(len(rollout.frames)),
+        features=features,
+        pairs=[
+            replace(pair, first=int(matches.frames[pair.first]), second=int(matches.frames[pair.second]))
+            for pair in matches.pairs
+        ],
+    )

@@ -1,0 +1,195 @@
+"""Likely causes of poses that the pictures contradict: the fault whose undoing makes them agree."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares, minimize_scalar
+
+from avp_habitat.poses import Intrinsics, camera_to_world, habitat_to_opencv, wrap_angle
+from avp_nerfstudio.check.pictures_rays import Stacked, frame_errors, pair_medians, ray_errors
+
+Float = NDArray[np.floating]
+
+FOCAL_RANGE = (0.75, 1.33)
+FOCAL_TOLERANCE = 0.01
+# Errors beyond this say no more than "wrong": false matches of a repeating texture do not pull.
+_CLIP_PX = 5.0
+# A fault of single frames leaves nearly all the others right.
+_FEW_FRAMES = 0.1
+
+
+def best_focal_factor(stacked: Stacked, poses: Float, intrinsics: Intrinsics) -> float:
+    """Factor on the focal length with which the matches agree best with the poses; 1.0 when it is right.
+
+    Args:
+        stacked: the matches.
+        poses: `(n, 4, 4)` camera_to_world, habitat axes.
+        intrinsics: as given.
+    """
+
+    def cost(factor: float) -> float:
+        errors = ray_errors(stacked, poses, _zoomed(intrinsics, factor)) / factor
+        return float(np.minimum(pair_medians(stacked, errors), _CLIP_PX).mean())
+
+    coarse = np.geomspace(*FOCAL_RANGE, 13)
+    best = int(np.argmin([cost(factor) for factor in coarse]))
+    bounds = coarse[max(best - 1, 0)], coarse[min(best + 1, len(coarse) - 1)]
+    return float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-4}).x)
+
+
+def likely_cause(
+    stacked: Stacked,
+    poses: Float,
+    intrinsics: Intrinsics,
+    *,
+    focal_factor: float,
+    limit_px: float,
+    frames: NDArray[np.int64],
+) -> str | None:
+    """The fault that explains why the pictures contradict the poses, in words.
+
+    Args:
+        stacked: the matches.
+        poses: `(n, 4, 4)` camera_to_world, habitat axes.
+        intrinsics: as given.
+        focal_factor: of `best_focal_factor`.
+        limit_px: frames whose `frame_errors` exceed it are wrong.
+        frames: `(n,)` frame numbers, for the text.
+
+    Returns:
+        None when no known fault explains it.
+    """
+    errors = frame_errors(stacked, poses, intrinsics)
+    wrong = np.flatnonzero(errors > limit_px)
+    single = len(wrong) <= max(2, _FEW_FRAMES * len(poses))
+    if single and abs(focal_factor - 1) < FOCAL_TOLERANCE:
+        return _cause_in_frames(stacked, poses, intrinsics, wrong=wrong, limit_px=limit_px, frames=frames)
+    return _cause_in_all(stacked, poses, intrinsics, focal_factor=focal_factor, limit_px=limit_px)
+
+
+def _cause_in_all(
+    stacked: Stacked, poses: Float, intrinsics: Intrinsics, *, focal_factor: float, limit_px: float
+) -> str | None:
+    # A repair has to leave at least half of the frames right, and better ones win.
+    best, best_wrong = None, 0.5
+    for text, undone, camera in _undone(poses, intrinsics, focal_factor):
+        wrong = _share_wrong(frame_errors(stacked, undone, camera), limit_px)
+        if wrong < best_wrong:
+            best, best_wrong = text, wrong
+    return best
+
+
+def _share_wrong(errors: Float, limit_px: float) -> float:
+    known = errors[np.isfinite(errors)]
+    return float(np.mean(known > limit_px)) if len(known) else 1.0
+
+
+def _zoomed(intrinsics: Intrinsics, factor: float) -> Intrinsics:
+    return replace(intrinsics, fx=intrinsics.fx * factor, fy=intrinsics.fy * factor)
+
+
+def _undone(poses: Float, intrinsics: Intrinsics, focal_factor: float) -> Iterator[tuple[str, Float, Intrinsics]]:
+    """Each fault of a whole rollout: its words, and the poses and intrinsics without it."""
+    repairs: list[tuple[str, Callable[[Float], Float]]] = [
+        ("camera axes look like opencv written as habitat: y and z flipped", habitat_to_opencv),
+        ("the rotations look transposed", _transposed),
+        ("the poses look like world-to-camera written as camera-to-world", np.linalg.inv),
+        ("the poses look one frame ahead of their pictures: picture i was taken at pose i - 1", _later),
+        ("the poses look one frame behind their pictures: picture i was taken at pose i + 1", _earlier),
+        ("the pitch looks like degrees written as radians", _pitch_was_degrees),
+        ("the pitch looks like radians converted to radians once more", _pitch_was_radians),
+    ]
+    longer = 100 * (1 / focal_factor - 1)
+    yield (
+        f"the focal length looks {abs(longer):.1f} % too {'long' if longer > 0 else 'short'}: "
+        f"expected {intrinsics.fx * focal_factor:.1f} px, found {intrinsics.fx:.1f} px",
+        poses,
+        _zoomed(intrinsics, focal_factor),
+    )
+    for text, repair in repairs:
+        yield text, repair(poses), intrinsics
+    for camera in _sides_swapped(intrinsics):
+        yield "width and height look swapped in the intrinsics", poses, camera
+
+
+def _sides_swapped(intrinsics: Intrinsics) -> Iterator[Intrinsics]:
+    """The principal point and focal lengths exchanged; or also the focal length taken from the wrong side."""
+    swapped = replace(intrinsics, fx=intrinsics.fy, fy=intrinsics.fx, cx=intrinsics.cy, cy=intrinsics.cx)
+    yield swapped
+    yield _zoomed(swapped, intrinsics.width / intrinsics.height)
+    yield _zoomed(intrinsics, intrinsics.width / intrinsics.height)
+
+
+def _transposed(poses: Float) -> Float:
+    turned = poses.copy()
+    turned[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
+    return turned
+
+
+def _later(poses: Float) -> Float:
+    return np.concatenate([poses[:1], poses[:-1]])
+
+
+def _earlier(poses: Float) -> Float:
+    return np.concatenate([poses[1:], poses[-1:]])
+
+
+def _any_yaw_and_pitch(poses: Float) -> tuple[Float, Float]:
+    """Yaw and pitch in radians of upright cameras, the pitch over the full circle."""
+    return np.arctan2(-poses[:, 2, 0], poses[:, 0, 0]), np.arctan2(-poses[:, 1, 2], poses[:, 1, 1])
+
+
+def _pitch_was_degrees(poses: Float) -> Float:
+    """Poses whose pitch is the whole number of degrees that, read as radians, gives the pitch they have."""
+    yaw, pitch = _any_yaw_and_pitch(poses)
+    degrees = np.arange(-90, 91)
+    nearest = np.abs(wrap_angle(pitch[:, None] - degrees)).argmin(axis=1)
+    return camera_to_world(poses[:, :3, 3], yaw=yaw, pitch=np.radians(degrees[nearest]))
+
+
+def _pitch_was_radians(poses: Float) -> Float:
+    yaw, pitch = _any_yaw_and_pitch(poses)
+    return camera_to_world(poses[:, :3, 3], yaw=yaw, pitch=np.degrees(pitch))
+
+
+def _cause_in_frames(
+    stacked: Stacked,
+    poses: Float,
+    intrinsics: Intrinsics,
+    *,
+    wrong: NDArray[np.int64],
+    limit_px: float,
+    frames: NDArray[np.int64],
+) -> str | None:
+    if not len(wrong):
+        return None
+    for place, first in enumerate(wrong):
+        for second in wrong[place + 1 :]:
+            exchanged = poses.copy()
+            exchanged[[first, second]] = poses[[second, first]]
+            if (frame_errors(stacked, exchanged, intrinsics)[[first, second]] <= limit_px).all():
+                return f"the poses of frames {frames[first]} and {frames[second]} look exchanged"
+    names = ", ".join(str(frame) for frame in frames[wrong])
+    if len(wrong) > 1:
+        return f"the poses of frames {names} do not fit their pictures, those of the others do"
+    offset = _position_error(stacked, poses, intrinsics, int(wrong[0]))
+    moved = poses.copy()
+    moved[wrong[0], :3, 3] -= offset
+    if frame_errors(stacked, moved, intrinsics)[wrong[0]] > limit_px:
+        return f"the pose of frame {names} does not fit its picture, those of the others do"
+    return f"the position of frame {names} looks {100 * np.linalg.norm(offset):.1f} cm off, those of the others fit"
+
+
+def _position_error(stacked: Stacked, poses: Float, intrinsics: Intrinsics, picture: int) -> Float:
+    """`(3,)` metres by which one picture's given position lies beside where its matches put it."""
+    own = (stacked.first[stacked.pair] == picture) | (stacked.second[stacked.pair] == picture)
+    part = replace(stacked, pair=stacked.pair[own], pixels=stacked.pixels[:, own])
+
+    def residuals(offset: Float) -> Float:
+        moved = poses.copy()
+        moved[picture, :3, 3] -= offset
+        return ray_errors(part, moved, intrinsics)
+
+    return least_squares(residuals, np.zeros(3), loss="cauchy", x_scale=0.01, diff_step=1e-3).x
