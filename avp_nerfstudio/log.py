@@ -143,7 +143,8 @@ def _track(
         if not run.continued:
             for scalar in read_events(folder / trained.config.logging.relative_log_dir, _every(trained.config)):
                 run.scalar(scalar.name, scalar.value, scalar.step, timestamp=scalar.timestamp)
-        run.scalars(facts.metrics | {f"eval/{name}": value for name, value in scores.items()}, trained.step)
+        for name, value in scores.items():
+            run.scalar(f"eval/{name}", value, trained.step)
         run.files([request.config, *folder.glob("dataparser_transforms.json")])
         run.files(files, _ARTIFACTS)
     return run.run_id

@@ -4,7 +4,7 @@ import dataclasses
 import math
 import re
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,9 +30,9 @@ class Facts:
     tags: dict[str, str]
     """Versions, commit, scene, policy."""
     metrics: dict[str, float] = field(default_factory=dict)
-    """`eval/...`: the figures of the rollout it was made from."""
+    """The figures of the rollout it was made from: `eval/...`, or `rollout/...` when it is not the whole of one."""
     policy_run: str | None = None
-    """MLflow run in which the rollout's policy was trained."""
+    """MLflow run in which the rollout's policy was trained; None for none or several."""
 
 
 def facts_of(config: Any) -> Facts:
@@ -50,23 +50,35 @@ def facts_of(config: Any) -> Facts:
     if (commit := git_commit()) is not None:
         tags["mlflow.source.git.commit"] = commit
     name = f"{config.method_name} {config.experiment_name}"
-    folder = rollout_folder(config)
-    if folder is None:
+    folders = rollout_folders(config)
+    if not folders:
         return Facts(name, settings(config), tags)
-    meta = read_meta(folder)
-    tags |= {"avp.rollout": str(folder)} | _origin(meta)
-    policy_run = meta.get("mlflow_run_id")
-    return Facts(name, settings(config) | _rollout_params(meta), tags, _figures(meta), policy_run)
+    metas = [read_meta(folder) for folder in folders]
+    policy_runs = {meta["mlflow_run_id"]: None for meta in metas if meta.get("mlflow_run_id")}
+    tags |= {"avp.rollout": _joined(folders), **_origin(metas[0])}
+    if policy_runs:
+        tags["avp.policy_run"] = _joined(policy_runs)
+    # The figures of a rollout are those of all its frames and of no others.
+    prefix = "eval" if _is_whole(config) else "rollout"
+    return Facts(
+        name,
+        settings(config) | _rollout_params(metas[0]),
+        tags,
+        _figures(metas[0], prefix),
+        next(iter(policy_runs)) if len(policy_runs) == 1 else None,
+    )
 
 
-def rollout_folder(config: Any) -> Path | None:
-    """The rollout that a training reads, whatever its dataparser; None when its data is something else."""
+def rollout_folders(config: Any) -> list[Path]:
+    """The rollouts that a training reads, whatever its dataparser; none when its data is something else."""
     manager = config.pipeline.datamanager
-    data = manager.data or getattr(getattr(manager, "dataparser", None), "data", None)
+    parser = getattr(manager, "dataparser", None)
+    data = manager.data or getattr(parser, "data", None)
     if data is None or data == Path():
-        return None
-    folder = Path(data).parent if Path(data).is_file() else Path(data)
-    return folder if (folder / "rollout.json").is_file() else None
+        return []
+    paths = [Path(path) for path in (data, *getattr(parser, "also", ()))]
+    folders = [path.parent if path.is_file() else path for path in paths]
+    return folders if all((folder / "rollout.json").is_file() for folder in folders) else []
 
 
 def settings(config: Any) -> dict[str, str]:
@@ -116,9 +128,19 @@ def _origin(meta: Mapping[str, Any]) -> dict[str, str]:
         "avp.scene_digest": leaves.get("scene.sha256"),
         "avp.policy": leaves.get("policy.name"),
         "avp.simulator": leaves.get("simulator.name"),
-        "avp.policy_run": meta.get("mlflow_run_id"),
     }
     return {key: str(value)[:_MAX_TAG] for key, value in named.items() if value is not None}
+
+
+def _is_whole(config: Any) -> bool:
+    """Whether all frames of one rollout are trained with."""
+    parser = getattr(config.pipeline.datamanager, "dataparser", None)
+    usual = (("also", ()), ("every", 1), ("max_views", 0))
+    return all(getattr(parser, option, value) == value for option, value in usual)
+
+
+def _joined(values: Iterable[object]) -> str:
+    return ", ".join(map(str, values))[:_MAX_TAG]
 
 
 def _rollout_params(meta: Mapping[str, Any]) -> dict[str, str]:
@@ -127,13 +149,13 @@ def _rollout_params(meta: Mapping[str, Any]) -> dict[str, str]:
     return {safe_name(f"rollout.{key}"): str(value)[:_MAX_PARAM] for key, value in leaves.items()}
 
 
-def _figures(meta: Mapping[str, Any]) -> dict[str, float]:
+def _figures(meta: Mapping[str, Any], prefix: str) -> dict[str, float]:
     """`eval/coverage`, `eval/views`, ...: the names under which the policy's evaluation logs them."""
     metrics = meta.get("metrics")
     if not isinstance(metrics, Mapping):
         return {}
     return {
-        safe_name(f"eval/{name}"): float(value)
+        safe_name(f"{prefix}/{name}"): float(value)
         for name, value in metrics.items()
         if isinstance(value, (int, float)) and math.isfinite(value)
     }

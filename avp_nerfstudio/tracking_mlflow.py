@@ -5,7 +5,7 @@ import os
 import re
 import time
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -137,11 +137,6 @@ class TrackedRun:
         if len(self._metrics) >= _MAX_METRICS or time.monotonic() - self._sent_at > _INTERVAL_S:
             self._send()
 
-    def scalars(self, values: Mapping[str, float], step: int) -> None:
-        """Queue several metrics."""
-        for name, value in values.items():
-            self.scalar(name, value, step)
-
     def files(self, paths: Iterable[Path], folder: str | None = None) -> None:
         """Store files as artifacts.
 
@@ -212,8 +207,12 @@ def _experiment_id(client: "MlflowClient", name: str) -> str:
 
 
 def _log_facts(client: "MlflowClient", run: "Run", facts: Facts) -> None:
-    """The settings that the run does not have yet: MLflow refuses to change one."""
-    from mlflow.entities import Param
+    """The settings and figures that the run does not have yet: MLflow refuses to change a setting."""
+    from mlflow.entities import Metric, Param
+
+    now = int(1000 * time.time())
+    metrics = [Metric(key, value, now, 0) for key, value in facts.metrics.items() if key not in run.data.metrics]
+    client.log_batch(run.info.run_id, metrics=metrics)
 
     params = [Param(key, value) for key, value in facts.params.items() if key not in run.data.params]
     for start in range(0, len(params), _MAX_PARAMS):

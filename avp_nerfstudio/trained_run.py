@@ -12,7 +12,6 @@ from typing import Any
 from avp_habitat.errors import AVPError
 
 _STEP = re.compile(r"step-(\d+)\.ckpt")
-_REFUSED = re.compile(r"GLOBAL (\S+)")
 
 
 class TrainedRunError(AVPError):
@@ -93,6 +92,7 @@ def open_trained(config: Any) -> TrainedRun:
 
     Raises:
         TrainedRunError: there is no checkpoint, or it cannot be loaded into this method.
+        UnsafeCheckpointError: the checkpoint holds more than numbers.
         RolloutError: the rollout it was trained on cannot be used.
     """
     import torch
@@ -109,6 +109,8 @@ def open_trained(config: Any) -> TrainedRun:
     pipeline.eval()
     try:
         eval_load_checkpoint(config, pipeline)
+    except AVPError:  # it holds what the safe loader refuses
+        raise
     except Exception as error:
         raise TrainedRunError(loading_fault(checkpoint, error)) from error
     return TrainedRun(config, pipeline, checkpoint, step)
@@ -116,11 +118,5 @@ def open_trained(config: Any) -> TrainedRun:
 
 def loading_fault(checkpoint: Path, error: Exception) -> str:
     """One line on why a checkpoint could not be loaded."""
-    refused = _REFUSED.search(str(error))
-    if refused:
-        return (
-            f"{checkpoint}: it holds the type {refused[1]}, which torch's safe loader refuses; nerfstudio writes no "
-            "such checkpoint: did it come from elsewhere?"
-        )
     line = " ".join(str(error).split())
     return f"{checkpoint}: expected a checkpoint of this method, could not load it: {line or type(error).__name__}"

@@ -149,6 +149,8 @@ class AVPTrainer(Trainer):
             raise TrainingError(f"{path}: expected a checkpoint to go on from, found none")
         try:
             super()._load_checkpoint()
+        except AVPError:  # it holds what the safe loader refuses
+            raise
         except Exception as error:
             assert path is not None
             raise TrainingError(loading_fault(path, error)) from error

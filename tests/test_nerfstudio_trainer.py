@@ -1,0 +1,265 @@
+import json
+import os
+import signal
+
+import pytest
+from nerfstudio_room import write_room
+from tracking import mlflow_home
+
+pytest.importorskip("nerfstudio")
+
+import torch
+import yaml
+from mlflow import MlflowClient
+from nerfstudio_training import tiny_config, train
+from rrd import entities, rows, verify
+
+from avp_habitat.errors import AVPError
+from avp_nerfstudio.interruption import Interruption
+from avp_nerfstudio.tracking_facts import Facts, facts_of, flat, rollout_folders, safe_name
+from avp_nerfstudio.tracking_mlflow import TrackingError, connect, open_run, shown
+from avp_nerfstudio.trainer import AVPTrainer, AVPTrainerConfig, TrainingError
+from avp_nerfstudio.training_progress import TrainingProgress
+
+
+@pytest.fixture
+def room(tmp_path):
+    return write_room(tmp_path / "room")
+
+
+@pytest.fixture
+def store(tmp_path, monkeypatch):
+    return MlflowClient(mlflow_home(tmp_path, monkeypatch))
+
+
+def runs(client):
+    return client.search_runs([experiment.experiment_id for experiment in client.search_experiments()])
+
+
+def tell_origin(room, **facts):
+    path = room / "rollout.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | facts))
+
+
+def signal_in_iteration(monkeypatch, step, number=signal.SIGINT, times=1):
+    iterate = AVPTrainer.train_iteration
+
+    def interrupted(self, at):
+        if at == step:
+            for _ in range(times):
+                os.kill(os.getpid(), number)
+        return iterate(self, at)
+
+    monkeypatch.setattr(AVPTrainer, "train_iteration", interrupted)
+
+
+def test_a_training_is_one_finished_run_with_losses_settings_versions_and_its_config(tmp_path, room, store):
+    scene = {"name": "a.glb", "sha256": "00ff"}
+    tell_origin(room, scene=scene, policy={"name": "oracle"}, seed=3, metrics={"coverage": 0.5, "views": 6.0})
+    config = train(tiny_config(room, tmp_path / "out", mlflow="auto"))
+    (run,) = runs(store)
+    assert run.info.status == "FINISHED"
+    assert run.info.run_name == "avp-nerfacto e"
+    assert run.info.run_id == (config.parent / "mlflow_run_id.txt").read_text().strip()
+    assert store.get_experiment(run.info.experiment_id).name == "avp"
+    losses = store.get_metric_history(run.info.run_id, "Train Loss")
+    assert [metric.step for metric in losses] == [0, 5, 10]
+    assert losses[2].value < losses[0].value
+    assert [m.step for m in store.get_metric_history(run.info.run_id, "learning_rate/fields")] == [0, 5, 10]
+    assert run.data.metrics["Train Iter time"] > 0
+    assert run.data.metrics["eval/coverage"] == 0.5
+    assert run.data.metrics["eval/views"] == 6
+    assert run.data.params["pipeline.model.log2_hashmap_size"] == "8"
+    assert run.data.params["optimizers.fields.optimizer.lr"] == "0.01"
+    assert run.data.params["rollout.seed"] == "3"
+    assert run.data.tags["avp.scene"] == "a.glb"
+    assert run.data.tags["avp.scene_digest"] == "00ff"
+    assert run.data.tags["avp.policy"] == "oracle"
+    assert run.data.tags["avp.rollout"] == str(room)
+    assert run.data.tags["version.torch"] == torch.__version__.partition("+")[0]
+    assert "mlflow.parentRunId" not in run.data.tags
+    kept = {file.path for file in store.list_artifacts(run.info.run_id)}
+    assert kept == {"config.yml", "dataparser_transforms.json"}
+
+
+def test_the_run_is_a_child_of_the_run_that_trained_the_policy(tmp_path, room, store):
+    policies = store.create_experiment("policies")
+    parent = store.create_run(policies).info.run_id
+    store.set_terminated(parent)
+    tell_origin(room, mlflow_run_id=parent)
+    train(tiny_config(room, tmp_path / "out", mlflow="auto", iterations=2))
+    (child,) = store.search_runs([policies], f"tags.mlflow.parentRunId = '{parent}'")
+    assert child.data.tags["avp.policy_run"] == parent
+    assert child.info.status == "FINISHED"
+
+
+def test_a_policy_run_elsewhere_is_named_without_becoming_the_parent(tmp_path, store):
+    policies = store.create_experiment("policies")
+    parent = store.create_run(policies).info.run_id
+    for policy_run, experiment in (("0" * 32, None), (parent, "other")):
+        facts = Facts("r", {}, {"avp.policy_run": policy_run}, policy_run=policy_run)
+        run = store.get_run(open_run(store, facts, folder=tmp_path, experiment=experiment).run_id)
+        assert store.get_experiment(run.info.experiment_id).name == (experiment or "avp")
+        assert run.data.tags["avp.policy_run"] == policy_run
+        assert "mlflow.parentRunId" not in run.data.tags
+
+
+def test_an_interrupted_training_saves_what_it_learned_and_goes_on_from_there(
+    tmp_path, room, store, monkeypatch, capsys
+):
+    with monkeypatch.context() as patch:
+        signal_in_iteration(patch, step=7)
+        with pytest.raises(SystemExit) as end:
+            train(tiny_config(room, tmp_path / "out", mlflow="auto", iterations=30))
+    assert end.value.code == 130
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    folder = tmp_path / "out/e/avp-nerfacto/t"
+    (checkpoint,) = (folder / "nerfstudio_models").iterdir()
+    assert checkpoint.name == "step-000000007.ckpt"
+    (killed,) = runs(store)
+    assert killed.info.status == "KILLED"
+    assert [m.step for m in store.get_metric_history(killed.info.run_id, "Train Loss")] == [0, 5]
+    told = capsys.readouterr().err
+    assert f"--load-dir {checkpoint.parent} --data {room} --max-num-iterations 22\n" in told
+    again = tiny_config(room, tmp_path / "out", mlflow="auto", iterations=22, load_dir=checkpoint.parent)
+    again.timestamp = "again"
+    config = train(again)
+    assert [path.name for path in (config.parent / "nerfstudio_models").iterdir()] == ["step-000000029.ckpt"]
+    (resumed,) = (run for run in runs(store) if run.info.run_id != killed.info.run_id)
+    assert resumed.data.tags["avp.continued_from"] == killed.info.run_id
+    assert [m.step for m in store.get_metric_history(resumed.info.run_id, "Train Loss")] == [10, 15, 20, 25]
+
+
+def test_a_second_interruption_ends_at_once_without_a_half_trained_checkpoint(tmp_path, room, monkeypatch, capsys):
+    signal_in_iteration(monkeypatch, step=3, number=signal.SIGTERM, times=2)
+    with pytest.raises(SystemExit) as end:
+        train(tiny_config(room, tmp_path / "out", iterations=30))
+    assert end.value.code == 130
+    assert not list((tmp_path / "out").rglob("*.ckpt"))
+    assert "nothing was saved" in capsys.readouterr().err
+
+
+def test_a_training_that_breaks_is_a_failed_run(tmp_path, room, store, monkeypatch):
+    def breaks(self, step):
+        raise ValueError("broken")
+
+    monkeypatch.setattr(AVPTrainer, "train_iteration", breaks)
+    with pytest.raises(ValueError, match="broken"):
+        train(tiny_config(room, tmp_path / "out", mlflow="auto"))
+    assert [run.info.status for run in runs(store)] == ["FAILED"]
+
+
+def test_a_recording_shows_losses_and_cameras(tmp_path, room):
+    path = tmp_path / "r" / "training.rrd"
+    train(tiny_config(room, tmp_path / "out", rerun=path))
+    verify(path)
+    found = entities(path)
+    assert len([name for name in found if name.startswith("/world/training/")]) == 6
+    assert len([name for name in found if name.startswith("/world/heldout/")]) == 2
+    losses = rows(path, "/plots/Train\\ Loss", "Scalars:scalars")
+    assert [step for step, _ in losses] == [0, 5, 10]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_a_device_that_is_not_there_is_refused_before_anything_is_written(tmp_path, room):
+    config = tiny_config(room, tmp_path / "out")
+    config.machine.device_type, config.timestamp = "cuda", "{timestamp}"
+    with pytest.raises(TrainingError, match=r"device-type cuda: no such device was found .* use cpu"):
+        train(config)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"mlflow": "nonsense://me:secret@host"}, "MLflow at nonsense://host cannot be used"),
+        ({"rerun": "room/rollout.json"}, "rollout.json: exists already"),
+        ({"load_dir": "room"}, r"room: expected a checkpoint \(step-\*.ckpt\), found none"),
+        ({"load_checkpoint": "room/step-000000001.ckpt"}, "expected a checkpoint to go on from, found none"),
+        ({"load_checkpoint": "room/rollout.json"}, "rollout.json: expected a checkpoint of this method"),
+    ],
+)
+def test_what_cannot_be_used_ends_the_training_with_one_line(tmp_path, room, options, text):
+    options = {key: tmp_path / value if key != "mlflow" else value for key, value in options.items()}
+    with pytest.raises(TrainingError, match=text) as error:
+        train(tiny_config(room, tmp_path / "out", **options))
+    assert isinstance(error.value, SystemExit)
+    assert isinstance(error.value, AVPError)
+    assert error.value.code == f"error: {error.value}"
+    assert "\n" not in str(error.value)
+
+
+def test_the_settings_survive_config_yml(tmp_path):
+    config = tiny_config(tmp_path, tmp_path, rerun=tmp_path / "a.rrd")
+    read = yaml.load(yaml.dump(config), Loader=yaml.Loader)
+    assert isinstance(read, AVPTrainerConfig)
+    assert read == config
+
+
+def test_names_become_what_mlflow_takes():
+    assert safe_name("Train Iter (time)") == "Train Iter time"
+    assert safe_name("Eval Images Metrics Dict (all images)/psnr") == "Eval Images Metrics Dict all images/psnr"
+    assert safe_name("../a//b:c") == "a/b_c"
+    assert flat({"a": {"b": 1, "c": {"d": 2}}, "e": 3}) == {"a.b": 1, "a.c.d": 2, "e": 3}
+
+
+def test_data_that_is_no_rollout_has_no_origin(tmp_path, room):
+    config = tiny_config(room, tmp_path)
+    config.pipeline.datamanager.data = room / "rollout.json"
+    assert rollout_folders(config) == [room]
+    config.pipeline.datamanager.data = tmp_path
+    assert rollout_folders(config) == []
+    assert facts_of(config).tags["avp.method"] == "avp-nerfacto"
+
+
+def test_figures_of_rollouts_are_not_taken_for_those_of_a_part_or_of_several(tmp_path, room):
+    other = write_room(tmp_path / "other")
+    config = tiny_config(room, tmp_path)
+    parser = config.pipeline.datamanager.dataparser
+    parser.data = room
+    for folder, policy_run in ((room, "1" * 32), (other, "2" * 32)):
+        tell_origin(folder, metrics={"coverage": 0.5}, mlflow_run_id=policy_run)
+    assert facts_of(config).metrics == {"eval/coverage": 0.5}
+    assert facts_of(config).policy_run == "1" * 32
+    parser.max_views = 3
+    assert facts_of(config).metrics == {"rollout/coverage": 0.5}
+    parser.max_views, parser.also = 0, (other,)
+    facts = facts_of(config)
+    assert facts.metrics == {"rollout/coverage": 0.5}
+    assert facts.tags["avp.rollout"] == f"{room}, {other}"
+    assert facts.tags["avp.policy_run"] == f"{'1' * 32}, {'2' * 32}"
+    assert facts.policy_run is None
+
+
+def test_a_store_that_fails_later_costs_a_warning(tmp_path, store):
+    run = open_run(store, Facts("r", {}, {}), folder=tmp_path)
+    run.scalar("Train Loss", 1.0, 0)
+    (tmp_path / "mlflow.db").unlink()
+    (tmp_path / "mlflow.db").mkdir()
+    with pytest.warns(UserWarning, match=f"MLflow run {run.run_id}"):
+        run.close("FINISHED")
+    with pytest.raises(TrackingError, match="did not take"):
+        run.files([tmp_path / "none"])
+
+
+def test_an_address_is_shown_without_its_password():
+    assert shown("postgresql://me:secret@host/db") == "postgresql://host/db"
+    assert shown("sqlite:///mlflow.db") == "sqlite:///mlflow.db"
+    with pytest.raises(TrackingError, match=r"expected an address such as sqlite:///mlflow\.db, or off"):
+        connect("nonsense://me:secret@host")
+
+
+def test_an_interruption_nobody_looks_for_interrupts_at_once():
+    with Interruption(idle=lambda: True), pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_log_gets_a_line_with_rate_and_time_left_now_and_then(capsys, monkeypatch):
+    progress = TrainingProgress(total=10)
+    progress.update({"loss": 1.0})
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr("avp_nerfstudio.training_progress._LINE_EVERY_S", 0.0)
+    progress.update({"loss": torch.tensor(0.25), "psnr": torch.tensor(20.0)})
+    line = capsys.readouterr().err
+    assert line.startswith("training:  20% 2/10 [")
+    assert line.endswith("it/s, loss 0.25, psnr 20]\n")
