@@ -1,0 +1,150 @@
+"""How well depth pictures agree with each other when their poses are believed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.poses import Intrinsics, project
+from avp_nerfstudio.check.depth_maps import DepthMaps
+
+Float = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+Index = NDArray[np.int64]
+
+TOLERANCE_M = 0.02
+"""Depths this close agree, metres."""
+NEIGHBOURS = 4
+"""Frames before and after in time that every frame is compared with."""
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Which points are looked for in which pictures."""
+
+    targets: Index
+    """`(t,)` the pictures."""
+    sources: Index
+    """`(t, k)` the frames whose points are projected into each of them."""
+    points: int
+    """How many points of each source."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Counts of points per pair, in the order of the pairs.
+
+    A point that lies behind what a picture shows is hidden there and says nothing; one that lies before it stands where
+    that picture saw through, which is a contradiction.
+    """
+
+    pairs: Pairs
+    """What was compared."""
+    agreeing: Index
+    """`(t, k)` points within the tolerance."""
+    contradicting: Index
+    """`(t, k)` points that stand in space seen to be empty."""
+    deviation_m: Float
+    """`(t, k)` sum over the agreeing points of the absolute difference in metres."""
+
+    def share(self, kept: Mask | None = None) -> float:
+        """Share of the comparable points that agree, among the `(n,)` kept frames; NaN when there is none."""
+        compared = self.compared(kept)
+        return float((self.agreeing * self._between(kept)).sum() / compared) if compared else float("nan")
+
+    def score(self, kept: Mask | None = None) -> float:
+        """Number of agreeing points times their share: poses under which hardly anything is comparable score low."""
+        agreeing, compared = float((self.agreeing * self._between(kept)).sum()), self.compared(kept)
+        return agreeing**2 / compared if compared else 0.0
+
+    def compared(self, kept: Mask | None = None) -> int:
+        """Number of comparable points among the `(n,)` kept frames."""
+        return int(((self.agreeing + self.contradicting) * self._between(kept)).sum())
+
+    def mean_deviation_m(self) -> float:
+        """Mean absolute difference of the points that agree, metres."""
+        return float(self.deviation_m.sum() / max(self.agreeing.sum(), 1))
+
+    def cost_m(self) -> float:
+        """Mean absolute difference of all comparable points, none counting more than the tolerance, metres."""
+        clipped = self.deviation_m.sum() + TOLERANCE_M * self.contradicting.sum()
+        return float(clipped / max(self.compared(), 1))
+
+    def per_frame(self, kept: Mask) -> tuple[Float, Index]:
+        """Share of agreeing points of each frame's pairs with the kept frames, as source and as target.
+
+        Args:
+            kept: `(n,)` frames that may judge others.
+
+        Returns:
+            `(n,)` shares, NaN without a comparable point, and `(n,)` numbers of comparable points.
+        """
+        agreeing, compared = self._sums(self.agreeing, kept), self._sums(self.agreeing + self.contradicting, kept)
+        with np.errstate(invalid="ignore"):
+            return agreeing / compared, compared
+
+    def _between(self, kept: Mask | None) -> Mask:
+        if kept is None:
+            return np.ones(self.pairs.sources.shape, bool)
+        return kept[self.pairs.sources] & kept[self.pairs.targets][:, None]
+
+    def _sums(self, counts: Index, kept: Mask) -> Index:
+        targets, sources = self.pairs.targets, self.pairs.sources
+        as_target = np.bincount(targets, (counts * kept[sources]).sum(axis=1), minlength=len(kept))
+        by_kept = counts * kept[targets][:, None]
+        as_source = np.bincount(sources.ravel(), by_kept.ravel(), minlength=len(kept))
+        return (as_target + as_source).astype(np.int64)
+
+
+def choose_pairs(count: int, *, partners: int, points: int, targets: int | None = None) -> Pairs:
+    """Pair frames with their neighbours in time and with others spread over the whole rollout.
+
+    The choice does not depend on the poses, which may be wrong.
+
+    Args:
+        count: number of frames.
+        partners: how many sources per picture, at most.
+        points: of each source.
+        targets: how many pictures, spread evenly; all when omitted.
+    """
+    near = np.concatenate([np.arange(-NEIGHBOURS, 0), np.arange(1, NEIGHBOURS + 1)])
+    if count - 1 <= partners:
+        offsets = np.arange(1, count)
+    else:
+        far = np.linspace(NEIGHBOURS + 1, count - NEIGHBOURS - 1, max(partners - len(near), 0)).round().astype(int)
+        offsets = np.unique(np.concatenate([near, far]) % count)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, targets or count)).round().astype(np.int64))
+    return Pairs(chosen, (chosen[:, None] + offsets) % count, points)
+
+
+def compare(
+    maps: DepthMaps, poses: Float, intrinsics: Intrinsics, pairs: Pairs, *, tolerance_m: float = TOLERANCE_M
+) -> Agreement:
+    """Look for points of some frames in other frames' depth.
+
+    Args:
+        maps: the depth.
+        poses: `(n, 4, 4)` camera_to_world, habitat axes, believed.
+        intrinsics: of the whole pictures, believed.
+        pairs: who is compared with whom.
+        tolerance_m: differences in depth up to this agree, metres.
+    """
+    camera = maps.camera(intrinsics)
+    used, sources_in_world = np.unique(pairs.sources, return_inverse=True)
+    sources_in_world = sources_in_world.reshape(pairs.sources.shape)
+    local = maps.local_points(intrinsics, used, pairs.points)
+    world = local @ np.swapaxes(poses[used, :3, :3], 1, 2) + poses[used, None, :3, 3]
+    usable = maps.counts > 0
+    shape = pairs.sources.shape
+    agreeing, contradicting = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
+    deviation = np.zeros(shape)
+    for row, (target, sources) in enumerate(zip(pairs.targets, pairs.sources, strict=True)):
+        pixel, depth = project(world[sources_in_world[row]].reshape(-1, 3), poses[target, None], camera)
+        seen, smooth = maps.look_up(int(target), pixel[0])
+        difference = (depth[0] - seen).reshape(len(sources), -1)
+        comparable = (smooth & (depth[0] > 0)).reshape(difference.shape) & usable[sources, None]
+        close = comparable & (np.abs(difference) <= tolerance_m)
+        agreeing[row] = close.sum(axis=1)
+        contradicting[row] = (comparable & (difference < -tolerance_m)).sum(axis=1)
+        deviation[row] = np.where(close, np.abs(difference), 0).sum(axis=1)
+    return Agreement(pairs, agreeing, contradicting, deviation)
