@@ -16,8 +16,8 @@ Float = NDArray[np.floating]
 
 STEP_M = 0.002
 """Steps may be so much longer than a forward move; in correct rollouts they exceed it by less than 0.000002 m."""
-CLIMB_M = 0.22
-"""Greatest change of height in a step: what agents can climb (0.2 m), and a little."""
+CLIMB_M, CLIMB_CELL_M = 0.2, 0.1
+"""What an agent can climb from one navigable cell to the next, and the side of a cell: a step may cross several."""
 ANGLE_RAD = 1e-4
 """Turns may differ so much from their amount; in correct rollouts by less than 0.000001."""
 TABLE_M = 2e-4
@@ -125,7 +125,8 @@ def impossible_steps(poses: Float, steps: Steps, actions: dict[str, Any]) -> dic
         allowed = reach if action == "move_forward" else 0.0
         wanted = {"turn_left": turn, "turn_right": -turn}.get(action, 0.0)
         lift = {"look_up": tilt, "look_down": -tilt}.get(action, 0.0)
-        if length[index] > allowed + STEP_M or abs(moved[index, 1]) > (CLIMB_M if allowed else STEP_M):
+        climbed = CLIMB_M * (length[index] / CLIMB_CELL_M + 1) if allowed else STEP_M
+        if length[index] > allowed + STEP_M or abs(moved[index, 1]) > climbed:
             found[index + 1] = f"{action} of {np.linalg.norm(moved[index]):.3f} m (at most {allowed:g} m)"
         elif abs(turned[index] - wanted) > np.degrees(ANGLE_RAD):
             found[index + 1] = f"{action} that turned by {turned[index]:+.1f} degrees ({wanted:+g} expected)"
