@@ -1,5 +1,7 @@
 import json
 import shutil
+import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -335,6 +337,30 @@ def test_of_a_long_rollout_few_pictures_are_decoded_and_it_is_read_once_for_all_
     assert len(parser.get_dataparser_outputs("val").image_filenames) == 2
     assert len(train.image_filenames) == 3 * MOST_VIEWS
     assert len(opened) == 2 * MOST_VIEWS
+
+
+@pytest.mark.slow
+def test_ten_thousand_frames_parse_in_three_seconds_of_work_and_little_memory(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / "benchmarks"))
+    from dataparser import lengthened
+
+    folder = tmp_path / "long"
+    lengthened(write_room(tmp_path / "room", frames=5), folder, 10_000)
+
+    def parse_both():
+        parser = AVPDataParserConfig(data=folder).setup()
+        return [parser.get_dataparser_outputs(split) for split in ("train", "val")]
+
+    parse(tmp_path / "room")  # the first cameras of a process make torch import for seconds
+    before = time.process_time()
+    train, val = parse_both()
+    assert time.process_time() - before < 3
+    assert (len(train.image_filenames), len(val.image_filenames)) == (10_000, 2)
+    tracemalloc.start()
+    parse_both()
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 50e6
 
 
 def test_a_rollout_without_heldout_views_says_how_to_get_them(broken):
