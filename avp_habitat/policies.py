@@ -30,6 +30,7 @@ _BASELINES = {
     "frontier": "avp_habitat.baselines.frontier:FrontierPolicy",
     "greedy": "avp_habitat.baselines.greedy:GreedyPolicy",
     "oracle": "avp_habitat.oracle.policy:OraclePolicy",
+    "survey": "avp_habitat.oracle.policy:SurveyPolicy",
 }
 POLICY_NAMES = tuple(_BASELINES)
 

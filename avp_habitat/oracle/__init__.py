@@ -1,5 +1,5 @@
-"""An offline planner with full knowledge of the scene, as a reference ceiling for policies."""
+"""Offline planners with full knowledge of the scene, as reference ceilings for policies."""
 
-from avp_habitat.oracle.policy import OraclePolicy
+from avp_habitat.oracle.policy import OraclePolicy, SurveyPolicy
 
-__all__ = ["OraclePolicy"]
+__all__ = ["OraclePolicy", "SurveyPolicy"]

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from avp_habitat.motion import sensor_poses
+from avp_habitat.oracle.surfaces import surface_points
 from avp_habitat.poses import Intrinsics, pixel_directions
 from avp_habitat.settings import TaskSettings
 from avp_habitat.simulators.base import Simulator
@@ -26,12 +27,16 @@ _AHEAD_M = 0.8
 
 @dataclass(frozen=True)
 class Lattice:
-    """Places, and which floor cells are not hidden from a camera above each of them; p places, m cells."""
+    """Places, and which points are not hidden from a camera above each of them; p places, m points.
+
+    The points are the floor's navigable cells, "cells" below, and after them those on other surfaces that were asked
+    for.
+    """
 
     places: Float
     """`(p, 3)` floor points, metres."""
     points: Float
-    """`(m, 3)` floor points of the navigable cells, metres."""
+    """`(m, 3)` floor points of the navigable cells, then points on other surfaces, metres."""
     sees: Bits
     """`(p, ceil(m / 64))` cells within range that a camera ray from above the place reaches, in any direction."""
     wanted: Bits
@@ -109,33 +114,38 @@ def views_from(lattice: Lattice, settings: TaskSettings, position: Float, yaw: F
     return sets
 
 
-def lattice_of(simulator: Simulator, settings: TaskSettings) -> Lattice:
-    """The scene's lattice for these settings, prepared once per simulator object."""
-    key = (settings.sensor_height_m, settings.max_range_m, settings.tolerance_m, settings.forward_m)
+def lattice_of(simulator: Simulator, settings: TaskSettings, *, surfaces: bool = False) -> Lattice:
+    """The scene's lattice for these settings, with or without all surfaces, prepared once per simulator object."""
+    key = (settings.sensor_height_m, settings.max_range_m, settings.tolerance_m, settings.forward_m, surfaces)
     known = _lattices.setdefault(simulator, {})
     if key not in known:
-        known[key] = make_lattice(simulator, settings)
+        beyond = surface_points(simulator, settings) if surfaces else None
+        known[key] = make_lattice(simulator, settings, beyond_floor=beyond)
     return known[key]
 
 
 _lattices: weakref.WeakKeyDictionary[Simulator, dict[tuple, Lattice]] = weakref.WeakKeyDictionary()
 
 
-def make_lattice(simulator: Simulator, settings: TaskSettings, *, entries: int = TABLE_ENTRIES) -> Lattice:
+def make_lattice(
+    simulator: Simulator, settings: TaskSettings, *, beyond_floor: Float | None = None, entries: int = TABLE_ENTRIES
+) -> Lattice:
     """Cast a ray from every place to every cell within range, and find the ways between the places.
 
     Args:
         simulator: of the scene.
         settings: of the task: sensor height, range, tolerance, length of a move.
+        beyond_floor: `(k, 3)` points on other surfaces that count like floor cells; none when omitted.
         entries: most pairs of a place and a cell; the lattice's spacing is the smallest multiple of a cell that
             keeps below.
     """
     from avp_habitat.oracle import kernels
 
     area = simulator.area
-    stride, cells = _stride(area.mask, entries)
-    places, points = area.centres[cells], np.ascontiguousarray(area.centres)
-    sees = _unhidden(simulator, places, settings)
+    points = np.concatenate([area.centres, np.empty((0, 3)) if beyond_floor is None else beyond_floor])
+    stride, cells = _stride(area.mask, entries // len(points))
+    places = area.centres[cells]
+    sees = _unhidden(simulator, places, points, settings)
     grid = np.full(area.mask.shape, -1, dtype=np.int64)
     grid[tuple(np.argwhere(area.mask)[cells].T)] = np.arange(len(cells))
     other, length = kernels.neighbour_table(np.ascontiguousarray(grid[::stride, ::stride]), len(cells))
@@ -164,19 +174,18 @@ def make_lattice(simulator: Simulator, settings: TaskSettings, *, entries: int =
     )
 
 
-def _stride(mask: NDArray[np.bool_], entries: int) -> tuple[int, NDArray[np.int64]]:
-    """Spacing in cells, and the numbers of the navigable cells that are places."""
+def _stride(mask: NDArray[np.bool_], most: int) -> tuple[int, NDArray[np.int64]]:
+    """Spacing in cells, and the numbers of the navigable cells that are places, at most so many if it can be."""
     rows, columns = np.nonzero(mask)
     stride = 0
     while True:
         stride += 1
         cells = np.flatnonzero((rows % stride == 0) & (columns % stride == 0))
-        if len(cells) * len(rows) <= entries and len(cells):
+        if 0 < len(cells) <= max(most, 1):
             return stride, cells
 
 
-def _unhidden(simulator: Simulator, places: Float, settings: TaskSettings) -> Bits:
-    points = simulator.area.centres
+def _unhidden(simulator: Simulator, places: Float, points: Float, settings: TaskSettings) -> Bits:
     ahead = np.zeros(len(places))
     pose = sensor_poses(settings, places, ahead, ahead)
     chunk = max(1, _RAYS_PER_CALL // len(points))

@@ -13,6 +13,7 @@ from avp_habitat.oracle.lattice import lattice_of, pack
 from avp_habitat.oracle.search import BeamSettings, beam_search
 from avp_habitat.oracle.states import start_state
 from avp_habitat.oracle.tour import covering_tour
+from avp_habitat.settings import TaskSettings
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,7 @@ def make_plan(view: AgentView, beam: BeamSettings | None = None) -> Plan:
         UsageError: the task does not count visible cells.
     """
     settings, area = view.settings, view.simulator.area
-    if settings.coverage_mode != "visible":
-        raise UsageError(
-            f"policy oracle: plans for coverage_mode 'visible', got {settings.coverage_mode!r}; choose another policy"
-        )
+    _check_mode("oracle", settings)
     views = settings.budget - view.steps
     lattice = lattice_of(view.simulator, settings)
     start = start_state(view.position, pack(view.observed[None])[0], yaw=view.yaw, pitch=view.pitch)
@@ -50,6 +48,37 @@ def make_plan(view: AgentView, beam: BeamSettings | None = None) -> Plan:
     found = beam_search(area, lattice, settings, start, views, beam or BeamSettings())
     plans = [Plan(actions, planned_coverage(view, actions)) for actions in (tour, found)]
     return max(plans, key=lambda plan: plan.coverage.sum())
+
+
+def make_survey(view: AgentView, beam: BeamSettings | None = None) -> Plan:
+    """Plan the rest of an agent's episode so that every surface is seen, not the floor alone.
+
+    The beam search of the oracle, with points on walls, furniture and ceiling beside the floor's cells. An episode that
+    is under way counts surfaces other than the floor as not yet seen.
+
+    Args:
+        view: the agent now.
+        beam: width of the search.
+
+    Raises:
+        UsageError: the task does not count visible cells.
+    """
+    settings = view.settings
+    _check_mode("survey", settings)
+    lattice = lattice_of(view.simulator, settings, surfaces=True)
+    seen = np.zeros(len(lattice.points), dtype=np.bool_)
+    seen[: len(view.observed)] = view.observed
+    start = start_state(view.position, pack(seen[None])[0], yaw=view.yaw, pitch=view.pitch)
+    views = settings.budget - view.steps
+    actions = beam_search(view.simulator.area, lattice, settings, start, views, beam or BeamSettings(width=300))
+    return Plan(actions, planned_coverage(view, actions))
+
+
+def _check_mode(policy: str, settings: TaskSettings) -> None:
+    if settings.coverage_mode != "visible":
+        raise UsageError(
+            f"policy {policy}: plans for coverage_mode 'visible', got {settings.coverage_mode!r}; choose another policy"
+        )
 
 
 def planned_coverage(view: AgentView, actions: NDArray[np.int64]) -> NDArray[np.float64]:

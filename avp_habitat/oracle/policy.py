@@ -1,13 +1,13 @@
-"""The oracle with Stable-Baselines3's `predict` interface: plans when an episode starts, then plays the plan."""
+"""Planners with Stable-Baselines3's `predict` interface: they plan when an episode starts, then play the plan."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.agent_view import AgentView, agent_views
-from avp_habitat.oracle.plan import Plan, make_plan
+from avp_habitat.oracle.plan import Plan, make_plan, make_survey
 from avp_habitat.oracle.search import BeamSettings
 
 
@@ -16,6 +16,8 @@ class OraclePolicy:
 
     It prepares each scene once and then plans for each episode; it never stops before the budget ends.
     """
+
+    _make_plan = staticmethod(make_plan)
 
     def __init__(self, views: Callable[[], list[AgentView]], beam: BeamSettings | None = None) -> None:
         """Use a source of the agents' states.
@@ -31,8 +33,8 @@ class OraclePolicy:
         self._next: dict[int, int] = {}
 
     @classmethod
-    def for_env(cls, env: Any, seed: int | None = None) -> "OraclePolicy":
-        """The oracle for an `AVPEnv` (also a wrapped one) or a vector environment of them; it draws nothing."""
+    def for_env(cls, env: Any, seed: int | None = None) -> Self:
+        """The planner for an `AVPEnv` (also a wrapped one) or a vector environment of them; it draws nothing."""
         del seed
         return cls(lambda: agent_views(env))
 
@@ -53,6 +55,12 @@ class OraclePolicy:
 
     def _action(self, agent: int, view: AgentView) -> int:
         if view.steps == 0 or self._next.get(agent) != view.steps:
-            self._plans[agent], self._begin[agent] = make_plan(view, self._beam), view.steps
+            self._plans[agent], self._begin[agent] = self._make_plan(view, self._beam), view.steps
         self._next[agent] = view.steps + 1
         return int(self._plans[agent].actions[view.steps - self._begin[agent]])
+
+
+class SurveyPolicy(OraclePolicy):
+    """The oracle for reconstruction: it plans to see every surface of the scene, not the floor alone."""
+
+    _make_plan = staticmethod(make_survey)

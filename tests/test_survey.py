@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+
+from avp_habitat.agent_view import agent_views
+from avp_habitat.baselines import RandomPolicy
+from avp_habitat.coverage import candidates
+from avp_habitat.env import AVPEnv
+from avp_habitat.errors import UsageError
+from avp_habitat.motion import sensor_poses
+from avp_habitat.oracle import OraclePolicy, SurveyPolicy
+from avp_habitat.oracle.search import BeamSettings
+from avp_habitat.oracle.surfaces import SPACING_M, surface_points
+
+NARROW = BeamSettings(width=50)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return AVPEnv("builtin:3", width=32, height=24, reward="coverage", budget=50)
+
+
+def share_of_surfaces_seen(env, policy):
+    """Play an episode and cast a true ray to every surface point in each of its views."""
+    observation, _ = env.reset(seed=4)
+    points, view = surface_points(env.simulator, env.settings), agent_views(env)[0]
+    seen, done, info = np.zeros(len(points), bool), False, {}
+    while not done:
+        action, _ = policy.predict(observation)
+        observation, _, terminated, truncated, info = env.step(int(action))
+        done = terminated or truncated
+        view = agent_views(env)[0]
+        pose = sensor_poses(env.settings, view.position[None], np.array([view.yaw]), np.array([view.pitch]))
+        pairs = candidates(pose, env.settings.intrinsics, points, ~seen[None], max_range_m=10.0)
+        seen[pairs[env.simulator.visible(pose, points, pairs, tolerance_m=0.1), 1]] = True
+    return seen.mean(), info["coverage"]
+
+
+def test_the_survey_sees_more_surfaces_than_the_oracle_and_more_floor_than_chance(env):
+    survey, its_floor = share_of_surfaces_seen(env, SurveyPolicy(lambda: agent_views(env), NARROW))
+    oracle, _ = share_of_surfaces_seen(env, OraclePolicy(lambda: agent_views(env), NARROW))
+    random, random_floor = share_of_surfaces_seen(env, RandomPolicy.for_env(env, seed=0))
+    assert survey > max(oracle, random) + 0.1
+    assert its_floor > random_floor + 0.1
+
+
+def test_surface_points_lie_on_surfaces_off_the_floor_and_apart(env):
+    points = surface_points(env.simulator, env.settings)
+    cubes = np.floor(points / SPACING_M).astype(int)
+    assert len(np.unique(cubes, axis=0)) == len(points) > 100
+    assert np.abs(points[:, 1] - env.simulator.area.centres[0, 1]).min() > 0.04
+    origin = env.simulator.area.centres[:1] + [0.0, 1.5, 0.0]
+    offset = points - origin
+    length = np.linalg.norm(offset, axis=1)
+    reached = env.simulator.distance(np.repeat(origin, len(points), axis=0), offset / length[:, None])
+    assert (reached < length + 0.05).all()
+
+
+def test_other_ways_of_counting_coverage_are_refused():
+    other = AVPEnv("builtin:3", width=32, height=24, coverage_mode="over")
+    other.reset(seed=0)
+    with pytest.raises(UsageError, match="policy survey: plans for coverage_mode 'visible'"):
+        SurveyPolicy.for_env(other).predict(np.zeros(12))
