@@ -50,6 +50,6 @@ class Preset:
 TABLE_4 = Preset(n_envs=64, n_steps=32, batch_size=512, n_epochs=10, learning_rate=3e-4, linear=False, ent_coef=0.02)
 """Table 4 of the paper: a buffer of 2048 steps, here of 64 agents."""
 MAP = Preset(n_envs=64, n_steps=128, batch_size=1024, n_epochs=6, learning_rate=5e-4, linear=True, ent_coef=0.01)
-"""For the map: a larger buffer and fewer passes, found by trial on white_room (docs/training.md)."""
+"""For the map: a larger buffer and fewer passes; chosen after a few trials on white_room (docs/training.md)."""
 PRESETS = {"numbers": TABLE_4, "map": MAP}
 """By kind of observation."""

@@ -31,7 +31,7 @@ class RerunCallback(BaseCallback):
     """Writes finished episodes to one `.rrd` file per training; open it with `rerun FILE`.
 
     The pictures are rendered after the episode has ended, so steps in between cost nothing. An episode of 80 steps with
-    8 pictures of 320x240 takes about 0.3 MB and a quarter of a second; `max_bytes` bounds the whole file, `max_share`
+    8 pictures of 320x240 takes about 0.3 MB and about half a second; `max_bytes` bounds the whole file, `max_share`
     the time, whatever the speed of the training.
     """
 

@@ -148,7 +148,10 @@ class SceneTables:
         return panorama.view_statistics(around, self._samples, self.key.max_range_m)
 
 
-_shared: weakref.WeakKeyDictionary[Simulator, dict[ViewKey, SceneTables]] = weakref.WeakKeyDictionary()
+# Tables hold their simulator, so the entry must not hold the tables: they live while someone's senses use them.
+_shared: weakref.WeakKeyDictionary[Simulator, weakref.WeakValueDictionary[ViewKey, SceneTables]] = (
+    weakref.WeakKeyDictionary()
+)
 
 
 def scene_tables(simulator: Simulator, settings: TaskSettings) -> SceneTables:
@@ -166,4 +169,8 @@ def scene_tables(simulator: Simulator, settings: TaskSettings) -> SceneTables:
         max_range_m=settings.max_range_m,
         tolerance_m=settings.tolerance_m,
     )
-    return _shared.setdefault(simulator, {}).setdefault(key, SceneTables(simulator, key))
+    known = _shared.setdefault(simulator, weakref.WeakValueDictionary())
+    tables = known.get(key)
+    if tables is None:
+        tables = known[key] = SceneTables(simulator, key)
+    return tables
