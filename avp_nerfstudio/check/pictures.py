@@ -25,8 +25,8 @@ Float = NDArray[np.floating]
 
 REPROJECTION_LIMIT_PX = 0.6
 FRAME_LIMIT_PX = 0.7
-ROTATION_LIMIT_DEG = 0.2
-FRAME_ROTATION_LIMIT_DEG = 1.5
+ROTATION_LIMIT_DEG = 0.5
+FRAME_ROTATION_LIMIT_DEG = 2.0
 DIRECTION_LIMIT_DEG = 3.0
 # Fewer pairs, or pairs for fewer frames, say too little to fail a rollout.
 MIN_PAIRS = 10

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,8 @@ def best_focal_factor(stacked: Stacked, poses: Float, intrinsics: Intrinsics) ->
     coarse = np.geomspace(*FOCAL_RANGE, 13)
     best = int(np.argmin([cost(factor) for factor in coarse]))
     bounds = coarse[max(best - 1, 0)], coarse[min(best + 1, len(coarse) - 1)]
-    return float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-4}).x)
+    found: Any = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-4})
+    return float(found.x)
 
 
 def likely_cause(
@@ -101,17 +103,20 @@ def _undone(poses: Float, intrinsics: Intrinsics, focal_factor: float) -> Iterat
         ("the pitch looks like degrees written as radians", _pitch_was_degrees),
         ("the pitch looks like radians converted to radians once more", _pitch_was_radians),
     ]
-    longer = 100 * (1 / focal_factor - 1)
-    yield (
-        f"the focal length looks {abs(longer):.1f} % too {'long' if longer > 0 else 'short'}: "
-        f"expected {intrinsics.fx * focal_factor:.1f} px, found {intrinsics.fx:.1f} px",
-        poses,
-        _zoomed(intrinsics, focal_factor),
-    )
+    if abs(focal_factor - 1) >= FOCAL_TOLERANCE:
+        yield _focal_words(intrinsics, focal_factor), poses, _zoomed(intrinsics, focal_factor)
     for text, repair in repairs:
         yield text, repair(poses), intrinsics
     for camera in _sides_swapped(intrinsics):
         yield "width and height look swapped in the intrinsics", poses, camera
+
+
+def _focal_words(intrinsics: Intrinsics, factor: float) -> str:
+    longer = 100 * (1 / factor - 1)
+    return (
+        f"the focal length looks {abs(longer):.1f} % too {'long' if longer > 0 else 'short'}: "
+        f"expected {intrinsics.fx * factor:.1f} px, found {intrinsics.fx:.1f} px"
+    )
 
 
 def _sides_swapped(intrinsics: Intrinsics) -> Iterator[Intrinsics]:

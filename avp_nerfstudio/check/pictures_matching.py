@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from avp_habitat.errors import RolloutError
+from avp_habitat.png import check_png_contents
 from avp_habitat.rollout import Rollout
 
 # Longer rollouts are judged by runs of neighbouring frames, spread evenly over the walk.
@@ -82,10 +83,13 @@ def match_pictures(rollout: Rollout, *, workdir: Path | None = None, progress: b
         progress: show bars where the output is a terminal.
 
     Raises:
-        RolloutError: a picture cannot be read.
+        RolloutError: a picture is damaged or cannot be read.
     """
     frames = _choose_frames(len(rollout.frames))
     paths = [rollout.frames[index].image for index in frames]
+    for path in paths:
+        # COLMAP goes on with the part of a damaged picture that it could decode.
+        check_png_contents(path)
     folder = paths[0].parent if paths else rollout.folder
     names = [path.name for path in paths]
     with quiet_colmap(), tempfile.TemporaryDirectory(dir=workdir, prefix="pictures-") as scratch:
