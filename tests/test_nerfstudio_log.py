@@ -148,6 +148,7 @@ def test_a_recording_shows_each_held_out_view_at_its_place(copy, tmp_path):
     assert not (copy.parent / "mlflow_run_id.txt").exists()
 
 
+@pytest.mark.slow  # plain nerfacto reads its data in processes of its own, which import everything again
 def test_plain_nerfacto_is_logged_too(tmp_path, store, shared):
     room = write_room(tmp_path / "room", width=SIZE[0], height=SIZE[1], heldout=1)
     ours = tiny_config(room, tmp_path)
