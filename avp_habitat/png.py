@@ -24,12 +24,12 @@ class PngKind:
     """Per channel."""
     colour_type: int
     """PNG's number for it: 0 grey, 2 RGB."""
-    name: str
-    """In the words of an error."""
+    wanted: str
+    """In the words of an error: expected …"""
 
 
-RGB_8 = PngKind(8, 2, "8-bit RGB")
-GREY_16 = PngKind(16, 0, "16-bit grey")
+RGB_8 = PngKind(8, 2, "an 8-bit RGB PNG")
+GREY_16 = PngKind(16, 0, "a 16-bit grey PNG")
 
 
 def check_png_structure(path: str, *, width: int, height: int, kind: PngKind) -> None:
@@ -50,20 +50,18 @@ def check_png_structure(path: str, *, width: int, height: int, kind: PngKind) ->
     try:
         header, end = _ends(path)
     except OSError as error:
-        raise RolloutError(f"{path}: expected a {kind.name} PNG, could not read it: {error.strerror}") from None
+        raise RolloutError(f"{path}: expected {kind.wanted}, could not read it: {error.strerror}") from None
     if not header.startswith(_SIGNATURE + _FIRST_CHUNK) or len(header) < _HEADER_BYTES:
-        raise RolloutError(
-            f"{path}: expected a {kind.name} PNG, found {'something else' if header else 'an empty file'}"
-        )
+        raise RolloutError(f"{path}: expected {kind.wanted}, found {'something else' if header else 'an empty file'}")
     found_width, found_height, bits, colour = struct.unpack(">IIBB", header[16:26])
     if (found_width, found_height) != (width, height):
         raise RolloutError(
             f"{path}: expected {width}x{height} pixels (rollout.json), found {found_width}x{found_height}"
         )
     if (bits, colour) != (kind.bits, kind.colour_type):
-        raise RolloutError(f"{path}: expected a {kind.name} PNG, found {bits} bits with PNG colour type {colour}")
+        raise RolloutError(f"{path}: expected {kind.wanted}, found {bits} bits with PNG colour type {colour}")
     if end != _LAST_CHUNK:
-        raise RolloutError(f"{path}: expected a {kind.name} PNG, found one without an end: was it cut short?")
+        raise RolloutError(f"{path}: expected {kind.wanted}, found one without an end: was it cut short?")
 
 
 def check_png_contents(path: Path) -> None:

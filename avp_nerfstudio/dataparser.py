@@ -90,7 +90,7 @@ class _Parsed:
 
 @dataclass
 class AVPDataParser(DataParser):
-    """Train split: the captured frames in the order of the steps; val and test: the held-out views."""
+    """Train split: the captured frames that the options choose; val and test: the held-out views."""
 
     config: AVPDataParserConfig
 

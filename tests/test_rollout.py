@@ -187,7 +187,10 @@ DAMAGES = {
     "empty image": (lambda f: (f / "images/frame_00000.png").write_bytes(b""), "8-bit RGB PNG, found an empty file"),
     "a jpeg": (lambda f: Image.new("RGB", (12, 8)).save(f / "images/frame_00000.png", "JPEG"), "found something else"),
     "wrong size": (lambda f: resize(f, "images/frame_00002.png", (8, 12), "RGB"), "expected 12x8 pixels.*found 8x12"),
-    "grey image": (lambda f: resize(f, "images/frame_00002.png", (12, 8), "L"), "expected a 8-bit RGB PNG"),
+    "grey image": (
+        lambda f: resize(f, "images/frame_00002.png", (12, 8), "L"),
+        "expected an 8-bit RGB PNG, found 8 bits with PNG colour type 0",
+    ),
     "8-bit depth": (lambda f: resize(f, "depth/frame_00002.png", (12, 8), "L"), "expected a 16-bit grey PNG"),
     "NaN pose": (
         lambda f: (f / "poses/frame_00001.txt").write_text("nan 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"),
