@@ -1,4 +1,4 @@
-"""`python -m avp_nerfstudio.check`: whether the poses and the depth of a rollout are right, and what is wrong if not."""
+"""`python -m avp_nerfstudio.check`: whether the poses and depth of a rollout are right, and what is wrong if not."""
 
 import argparse
 import sys

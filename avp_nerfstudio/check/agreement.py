@@ -141,7 +141,7 @@ def compare(
     for row, (target, sources) in enumerate(zip(pairs.targets, pairs.sources, strict=True)):
         pixel, depth = project(world[sources_in_world[row]].reshape(-1, 3), poses[target, None], camera)
         seen, smooth = maps.look_up(int(target), pixel[0])
-        difference = (depth[0] - seen).reshape(len(sources), -1)
+        difference = (depth[0] - seen).reshape(len(sources), local.shape[1])
         comparable = (smooth & (depth[0] > 0)).reshape(difference.shape) & usable[sources, None]
         close = comparable & (np.abs(difference) <= tolerance_m)
         agreeing[row] = close.sum(axis=1)

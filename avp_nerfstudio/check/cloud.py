@@ -14,9 +14,9 @@ from avp_nerfstudio.check.hypotheses import Cameras
 
 Float = NDArray[np.floating]
 
-BAD_COLOUR = (214, 39, 40)
+BAD_COLOUR = (255, 48, 48)
 """Of frames that disagree."""
-GOOD_COLOUR = (31, 119, 180)
+GOOD_COLOUR = (64, 160, 255)
 """Of all others."""
 FRUSTUM_M = 0.2
 _FRAMES = 400
@@ -39,7 +39,8 @@ def fuse(rollout: Rollout, maps: DepthMaps, cameras: Cameras, bad: NDArray[np.bo
     chosen = np.unique(np.linspace(0, n - 1, min(n, _FRAMES)).round().astype(int))
     chosen = np.union1d(chosen, np.flatnonzero(bad)[:_FRAMES])
     views = rollout.frames + rollout.heldout
-    points, colours = [np.empty((0, 3))], [np.empty((0, 3), np.uint8)]
+    points: list[Float] = []
+    colours: list[NDArray[np.uint8]] = []
     for frame in chosen:
         found, _ = maps.surface(int(frame), cameras.poses[frame], cameras.intrinsics, _POINTS)
         picture = read_rgb(views[frame].image)[:: maps.stride, :: maps.stride].reshape(-1, 3)
@@ -79,5 +80,5 @@ def write_ply(path: Path, cloud: Cloud) -> None:
     written = o3d.geometry.PointCloud()
     written.points = o3d.utility.Vector3dVector(cloud.points)
     written.colors = o3d.utility.Vector3dVector(cloud.colours / 255)
-    if not o3d.io.write_point_cloud(str(path), written):
+    if not o3d.io.write_point_cloud(str(path), written):  # pyright: ignore[reportArgumentType]
         raise OSError(f"Open3D could not write {path.name}")

@@ -37,7 +37,7 @@ class Comparison:
         found = compare(self.maps, cameras.poses, cameras.intrinsics, self.few_pairs, tolerance_m=tolerance_m)
         return found.score(cameras.kept)
 
-    def some(self, cameras: Cameras, targets: list[int], sources: NDArray[np.integer]) -> Agreement:
+    def some(self, cameras: Cameras, targets: list[int], sources: NDArray[np.int64]) -> Agreement:
         """Agreement of the points of some frames with the depth of a few others."""
         rows = [np.resize(sources[sources != target], len(sources)) for target in targets]
         pairs = Pairs(np.array(targets), np.stack(rows), _POINTS_OF_SOME)

@@ -12,6 +12,7 @@ from avp_nerfstudio.check.verdict import Verdict
 _ABOVE_CAMERAS_M = 0.3
 _MOST_POINTS = 150_000
 _OUTLIERS = 0.5
+_GROUND = "#30343a"
 
 
 def draw_overview(path: Path, cloud: Cloud, cameras: Cameras, bad: NDArray[np.bool_], verdicts: list[Verdict]) -> None:
@@ -56,7 +57,7 @@ def draw_overview(path: Path, cloud: Cloud, cameras: Cameras, bad: NDArray[np.bo
 
 def _pair(figure, column: int):
     """The axes of a view and the two coordinates it shows; from above z points down, as on a map."""
-    axes = figure.add_subplot(1, 2, column + 1)
+    axes = figure.add_subplot(1, 2, column + 1, facecolor=_GROUND)
     if column == 0:
         axes.invert_yaxis()
     return axes, ((0, 2), (0, 1))[column]

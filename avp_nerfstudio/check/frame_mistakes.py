@@ -21,7 +21,7 @@ Names = Callable[[int], str]
 def frame_mistake(
     comparison: Comparison,
     given: Cameras,
-    bad: NDArray[np.integer],
+    bad: NDArray[np.int64],
     *,
     corrections: dict[int, Correction | None],
     name: Names,
@@ -43,7 +43,7 @@ def frame_mistake(
     return _off(given, bad, corrections, name)
 
 
-def _exchanges(given: Cameras, bad: NDArray[np.integer]) -> Iterator[tuple[int, int]]:
+def _exchanges(given: Cameras, bad: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
     """Pairs of frames that may have been exchanged; a single bad frame with any other."""
     if len(bad) == 1:
         first = int(bad[0])
@@ -52,7 +52,7 @@ def _exchanges(given: Cameras, bad: NDArray[np.integer]) -> Iterator[tuple[int, 
         yield from combinations(sorted(int(frame) for frame in bad), 2)
 
 
-def _both_agree(comparison: Comparison, cameras: Cameras, a: int, b: int, others: NDArray[np.integer]) -> bool:
+def _both_agree(comparison: Comparison, cameras: Cameras, a: int, b: int, others: NDArray[np.int64]) -> bool:
     for frame in (a, b):
         found = comparison.some(cameras, [frame], others)
         if found.compared() < LEAST_COMPARED or found.share() < AGREEING_SHARE_OF_FRAME:
@@ -60,11 +60,11 @@ def _both_agree(comparison: Comparison, cameras: Cameras, a: int, b: int, others
     return True
 
 
-def _off(given: Cameras, bad: NDArray[np.integer], corrections: dict[int, Correction | None], name: Names) -> Diagnosis:
+def _off(given: Cameras, bad: NDArray[np.int64], corrections: dict[int, Correction | None], name: Names) -> Diagnosis:
     parts, poses = [], given.poses.copy()
     for frame in map(int, bad[:_MOST_NAMED]):
         correction = corrections.get(frame)
-        if correction is None:
+        if correction is None or not correction.distance_m + correction.rotation_deg:
             parts.append(f"{name(frame)} does not fit the others")
             continue
         poses[frame] = correction.camera_to_world

@@ -110,7 +110,8 @@ def _diagnose(
     walk = Walk.of(rollout.meta, given.poses[: given.captured])
     numbers = np.flatnonzero(bad)
     found = mistake_with_all(comparison, given, walk)
-    if found is None and len(numbers) > _FEW:
+    of_heldout = len(numbers) > 1 and bool((numbers >= given.captured).all())
+    if found is None and (len(numbers) > _FEW or of_heldout):
         found = mistake_with_a_part(comparison, given, walk)
     if found is None and 0 < len(numbers) <= max(_FEW, 0.25 * len(bad)):
         found = frame_mistake(comparison, given, numbers, corrections=corrections, name=partial(name_of, given))
@@ -133,7 +134,7 @@ def _corrections(
 
 
 def _correction(
-    comparison: Comparison, given: Cameras, frame: int, partners: NDArray[np.integer], *, far: bool
+    comparison: Comparison, given: Cameras, frame: int, partners: NDArray[np.int64], *, far: bool
 ) -> Correction | None:
     """ICP's correction where it makes the frame agree better; else none, whatever ICP says."""
     correction = register(comparison.maps, given, frame, partners, far=far) if len(partners) else None

@@ -131,7 +131,7 @@ def _pitches(comparison: Comparison, given: Cameras, walk: Walk, group: str) -> 
         pitch[frame] = values[0] if on_grid is None else on_grid
         if on_grid is None:
             unsettled[int(frame)] = values
-    settled = np.setdiff1d(np.arange(len(pitch)), list(unsettled))
+    settled = np.setdiff1d(np.arange(len(pitch)), np.array(list(unsettled), np.int64))
     if len(settled):
         for frame, values in unsettled.items():
             pitch[frame] = _pitch_by_depth(comparison, given, pitch, frame, values, settled)
@@ -147,7 +147,7 @@ def _on_tilt_grid(values: Float, tilt_deg: float) -> float | None:
 
 
 def _pitch_by_depth(
-    comparison: Comparison, given: Cameras, pitch: Float, frame: int, values: Float, settled: NDArray[np.integer]
+    comparison: Comparison, given: Cameras, pitch: Float, frame: int, values: Float, settled: NDArray[np.int64]
 ) -> float:
     scores = []
     for value in values:

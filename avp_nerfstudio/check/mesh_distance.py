@@ -71,12 +71,12 @@ def _distances(maps: DepthMaps, cameras: Cameras, scene: Scene) -> NDArray[np.fl
 
     casting = o3d.t.geometry.RaycastingScene()
     casting.add_triangles(
-        o3d.core.Tensor(np.ascontiguousarray(scene.mesh.vertices, np.float32)),
-        o3d.core.Tensor(np.ascontiguousarray(scene.mesh.triangles, np.uint32)),
+        o3d.core.Tensor.from_numpy(np.ascontiguousarray(scene.mesh.vertices, np.float32)),
+        o3d.core.Tensor.from_numpy(np.ascontiguousarray(scene.mesh.triangles, np.uint32)),
     )
     found = []
     for frames in np.array_split(np.arange(len(maps)), -(-len(maps) // _FRAMES_PER_CALL)):
         rotation, centre = cameras.poses[frames, :3, :3], cameras.poses[frames, None, :3, 3]
         world = maps.local_points(cameras.intrinsics, frames, POINTS) @ np.swapaxes(rotation, 1, 2) + centre
-        found.append(casting.compute_distance(o3d.core.Tensor(world.astype(np.float32))).numpy())
+        found.append(casting.compute_distance(o3d.core.Tensor.from_numpy(world.astype(np.float32))).numpy())
     return np.concatenate(found)

@@ -38,7 +38,7 @@ class Correction:
 
 
 def register(
-    maps: DepthMaps, cameras: Cameras, frame: int, partners: NDArray[np.integer], *, far: bool
+    maps: DepthMaps, cameras: Cameras, frame: int, partners: NDArray[np.int64], *, far: bool
 ) -> Correction | None:
     """Register one frame to others that are believed.
 
