@@ -3,9 +3,9 @@
 A few random views of a generated room are captured at the given size; folders of more frames are made of them with hard
 links, so that every frame is a file of its own with a real picture behind it. Each folder is parsed for both splits
 that a training asks for, in a process of its own: `first_s` is the first time (the files were just written, so they are
-in the system's cache as far as memory allows), `train_s` and `val_s` are medians of three more times, each by a new
-parser. `rss_growth_mb` is by how much the process's highest memory rose the first time; `python_peak_mb` is the most
-that Python and numpy held, counted by tracemalloc in a last one.
+in the system's cache as far as memory allows), `train_s`, `val_s` and `cpu_s` (of both) are medians of three more
+times, each by a new parser. `rss_growth_mb` is by how much the process's highest memory rose the first time;
+`python_peak_mb` is the most that Python and numpy held, counted by tracemalloc in a last one.
 """
 
 import argparse
@@ -120,25 +120,26 @@ def _measure(folder: Path) -> dict[str, float]:
     # The first Cameras of a process make torch import sympy, which takes seconds and is not the parser's.
     Cameras(torch.eye(4)[None, :3], fx=1.0, fy=1.0, cx=1.0, cy=1.0, width=2, height=2)
 
-    def parse() -> tuple[float, float]:
-        """Seconds for the train split, and for the val split after it."""
+    def parse() -> tuple[float, float, float]:
+        """Seconds for the train split and for the val split after it, and the processor's seconds for both."""
         parser: Any = AVPDataParserConfig(data=folder).setup()
-        start = time.perf_counter()
+        start, cpu = time.perf_counter(), time.process_time()
         outputs = [parser.get_dataparser_outputs("train")]
         between = time.perf_counter()
         outputs.append(parser.get_dataparser_outputs("val"))
-        return between - start, time.perf_counter() - between
+        return between - start, time.perf_counter() - between, time.process_time() - cpu
 
     before = _highest_memory_mb()
     first = parse()
     growth = _highest_memory_mb() - before
-    times = [parse() for _ in range(_REPEATS)]
+    train, val, cpu = (statistics.median(times) for times in zip(*(parse() for _ in range(_REPEATS)), strict=True))
     tracemalloc.start()
     parse()
     return {
-        "first_s": sum(first),
-        "train_s": statistics.median(train for train, _ in times),
-        "val_s": statistics.median(val for _, val in times),
+        "first_s": first[0] + first[1],
+        "train_s": train,
+        "val_s": val,
+        "cpu_s": cpu,
         "rss_growth_mb": growth,
         "python_peak_mb": tracemalloc.get_traced_memory()[1] / 1e6,
     }
