@@ -295,6 +295,7 @@ def executable(name, *arguments, environment=None):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("method", [["avp-nerfacto"], PLAIN], ids=lambda method: method[0])
 def test_every_installed_program_works_on_a_checkpoint(walk, tmp_path, shared, method):
     weights = {"TORCH_HOME": str(shared / "torch_home")}
