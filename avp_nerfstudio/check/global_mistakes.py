@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_nerfstudio.check import hypotheses
-from avp_nerfstudio.check.comparison import Comparison, agrees
+from avp_nerfstudio.check.comparison import LEAST_COMPARED, Comparison, agrees
 from avp_nerfstudio.check.hypotheses import Cameras, Hypothesis
 from avp_nerfstudio.check.upright import full_angles, has_no_roll, is_upright
 
@@ -16,6 +16,7 @@ Float = NDArray[np.floating]
 
 _FINE_M = 0.005
 _VERIFIED = 4
+_WEIGHT_OF_CONTRADICTION = 10
 _FACTORS = np.geomspace(0.5, 2.0, 41)
 _UNITS = (0.001, 0.01, 0.1, 0.3048, 1 / 0.3048, 10.0, 100.0, 1000.0)
 
@@ -132,10 +133,40 @@ def _pitches(comparison: Comparison, given: Cameras, walk: Walk, group: str) -> 
         if on_grid is None:
             unsettled[int(frame)] = values
     settled = np.setdiff1d(np.arange(len(pitch)), np.array(list(unsettled), np.int64))
-    if len(settled):
-        for frame, values in unsettled.items():
-            pitch[frame] = _pitch_by_depth(comparison, given, pitch, frame, values, settled)
-    yield hypotheses.degrees_taken_for_radians(given, pitch, group)
+    undecided = _settle(comparison, given, pitch, settled, unsettled)
+    found = hypotheses.degrees_taken_for_radians(given, pitch, group)
+    kept = given.kept & ~np.isin(np.arange(len(pitch)), undecided)
+    yield replace(found, cameras=replace(found.cameras, kept=kept))
+
+
+def _settle(
+    comparison: Comparison, given: Cameras, pitch: Float, settled: NDArray[np.int64], unsettled: dict[int, Float]
+) -> list[int]:
+    """Decide the pitch of the frames that settled ones see, then of those that these see, and so on.
+
+    Args:
+        comparison: for what is tried.
+        given: the cameras.
+        pitch: `(n,)` radians; changed in place.
+        settled: frames whose pitch is known.
+        unsettled: the possible pitches of the others.
+
+    Returns:
+        The frames that no settled one sees.
+    """
+    open_frames = list(unsettled)
+    while open_frames and len(settled):
+        decided = []
+        for frame in open_frames:
+            best = _pitch_by_depth(comparison, given, pitch, frame, unsettled[frame], settled)
+            if best is not None:
+                pitch[frame] = best
+                decided.append(frame)
+        if not decided:
+            break
+        settled = np.append(settled, decided)
+        open_frames = [frame for frame in open_frames if frame not in decided]
+    return open_frames
 
 
 def _on_tilt_grid(values: Float, tilt_deg: float) -> float | None:
@@ -148,12 +179,15 @@ def _on_tilt_grid(values: Float, tilt_deg: float) -> float | None:
 
 def _pitch_by_depth(
     comparison: Comparison, given: Cameras, pitch: Float, frame: int, values: Float, settled: NDArray[np.int64]
-) -> float:
+) -> float | None:
+    """The pitch, of the possible ones, with which settled frames agree; None where they see too little to say."""
     scores = []
     for value in values:
         tried = pitch.copy()
         tried[frame] = value
         cameras = replace(given, poses=hypotheses.with_pitch(given.poses, tried))
         found = comparison.some(cameras, [frame], settled)
-        scores.append(found.score())
-    return float(values[int(np.argmax(scores))])
+        # The right pitch has hardly any contradiction; a wrong one may have more points in view, and agree with some.
+        scores.append(int(found.agreeing.sum()) - _WEIGHT_OF_CONTRADICTION * int(found.contradicting.sum()))
+    best = int(np.argmax(scores))
+    return float(values[best]) if scores[best] >= LEAST_COMPARED else None
