@@ -134,6 +134,8 @@ def _pitches(comparison: Comparison, given: Cameras, walk: Walk, group: str) -> 
             unsettled[int(frame)] = values
     settled = np.setdiff1d(np.arange(len(pitch)), np.array(list(unsettled), np.int64))
     undecided = _settle(comparison, given, pitch, settled, unsettled)
+    if len(undecided) > len(members) / 2:
+        return
     found = hypotheses.degrees_taken_for_radians(given, pitch, group)
     kept = given.kept & ~np.isin(np.arange(len(pitch)), undecided)
     yield replace(found, cameras=replace(found.cameras, kept=kept))
