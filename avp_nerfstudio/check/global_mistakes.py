@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_nerfstudio.check import hypotheses
+from avp_nerfstudio.check.agreement import Agreement
 from avp_nerfstudio.check.comparison import LEAST_COMPARED, Comparison, agrees
 from avp_nerfstudio.check.hypotheses import Cameras, Hypothesis
 from avp_nerfstudio.check.upright import full_angles, has_no_roll, is_upright
@@ -16,6 +17,7 @@ Float = NDArray[np.floating]
 
 _FINE_M = 0.005
 _VERIFIED = 4
+_STILL_JUDGED = 0.8
 _WEIGHT_OF_CONTRADICTION = 10
 _FACTORS = np.geomspace(0.5, 2.0, 41)
 _UNITS = (0.001, 0.01, 0.1, 0.3048, 1 / 0.3048, 10.0, 100.0, 1000.0)
@@ -73,13 +75,15 @@ def mistake_with_a_part(comparison: Comparison, given: Cameras, walk: Walk) -> D
 
 def _best(comparison: Comparison, given: Cameras, tried: Iterable[Hypothesis], walk: Walk) -> Diagnosis | None:
     scored = sorted(((comparison.quick(h.cameras), h) for h in tried), key=lambda pair: -pair[0])
-    least = comparison.full(given).score()
+    believed = comparison.full(given)
+    least, judged = believed.score(), _judged(believed, given.kept)
     accepted = []
     for _, hypothesis in scored[:_VERIFIED]:
         kept = hypothesis.cameras.kept
         agreement = comparison.full(hypothesis.cameras)
         # Undoing a mistake makes more points agree; cameras that are torn apart have no contradictions either.
-        if agrees(agreement, kept) and agreement.score(kept) > least:
+        together = _judged(agreement, kept) >= _STILL_JUDGED * judged
+        if together and agrees(agreement, kept) and agreement.score(kept) > least:
             # The world may hang upside down and yet agree with itself: cameras of a walker stand upright.
             upright = float(is_upright(hypothesis.cameras.poses, limit_deg=walk.pitch_limit_deg).mean())
             accepted.append(((upright, agreement.score(kept)), hypothesis))
@@ -87,6 +91,11 @@ def _best(comparison: Comparison, given: Cameras, tried: Iterable[Hypothesis], w
         return None
     best = max(accepted, key=lambda pair: pair[0])[1]
     return Diagnosis(best.key, best.cause, best.cameras)
+
+
+def _judged(agreement: Agreement, kept: NDArray[np.bool_]) -> int:
+    """How many of the kept frames share enough with others to be judged."""
+    return int((agreement.per_frame(kept)[1] >= LEAST_COMPARED)[kept].sum())
 
 
 def _of_all(comparison: Comparison, given: Cameras, walk: Walk) -> Iterator[Hypothesis]:
