@@ -5,14 +5,16 @@ from dataclasses import dataclass
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
-from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
 from avp_nerfstudio.dataparser import AVPDataParserConfig
+from avp_nerfstudio.dataset import RGBDDataset
 from avp_nerfstudio.model import AVPNerfactoModelConfig
+from avp_nerfstudio.trainer import AVPTrainerConfig
 
 ITERATIONS = 2500
 
@@ -27,7 +29,7 @@ class FusedAdamConfig(AdamOptimizerConfig):
 
 def _optimizer(iterations: int) -> dict[str, object]:
     return {
-        "optimizer": FusedAdamConfig(lr=1e-2, eps=1e-15),
+        "optimizer": FusedAdamConfig(lr=2e-2, eps=1e-15),
         "scheduler": ExponentialDecaySchedulerConfig(lr_final=1e-3, max_steps=iterations),
     }
 
@@ -39,10 +41,10 @@ def set_iterations(config: TrainerConfig, iterations: int) -> None:
         group["scheduler"].max_steps = iterations
 
 
-def trainer_config() -> TrainerConfig:
+def trainer_config() -> AVPTrainerConfig:
     """The whole configuration, for CUDA where there is a device and else for the CPU."""
     cuda = torch.cuda.is_available()
-    return TrainerConfig(
+    return AVPTrainerConfig(
         method_name="avp-nerfacto",
         max_num_iterations=ITERATIONS,
         # Pictures are scored once, by ns-eval; doing so while training would take longer than the training.
@@ -55,17 +57,20 @@ def trainer_config() -> TrainerConfig:
         machine=MachineConfig(device_type="cuda" if cuda else "cpu"),
         pipeline=VanillaPipelineConfig(
             datamanager=VanillaDataManagerConfig(
-                dataparser=AVPDataParserConfig(), train_num_rays_per_batch=512, eval_num_rays_per_batch=1024
+                _target=VanillaDataManager[RGBDDataset],
+                dataparser=AVPDataParserConfig(),
+                train_num_rays_per_batch=1024,
+                eval_num_rays_per_batch=1024,
             ),
             model=AVPNerfactoModelConfig(
                 implementation="tcnn" if cuda else "torch",
                 eval_num_rays_per_chunk=1 << 13,
-                num_levels=8,
-                max_res=512,
-                log2_hashmap_size=16,
+                num_levels=10,
+                max_res=1024,
+                log2_hashmap_size=17,
                 hidden_dim=64,
                 hidden_dim_color=64,
-                num_nerf_samples_per_ray=16,
+                num_nerf_samples_per_ray=8,
                 num_proposal_samples_per_ray=(64,),
                 num_proposal_iterations=1,
                 proposal_initial_sampler="uniform",
@@ -80,7 +85,8 @@ def trainer_config() -> TrainerConfig:
             ),
         ),
         optimizers={"proposal_networks": _optimizer(ITERATIONS), "fields": _optimizer(ITERATIONS)},
-        logging=LoggingConfig(steps_per_log=50, local_writer=LocalWriterConfig(enable=True)),
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 13, quit_on_train_completion=True),
+        # The trainer has a progress bar of its own, and its last lines are better the last.
+        logging=LoggingConfig(steps_per_log=50, local_writer=LocalWriterConfig(enable=False), profiler="none"),
+        viewer=ViewerConfig(websocket_host="127.0.0.1", num_rays_per_chunk=1 << 13, quit_on_train_completion=True),
         vis="tensorboard",
     )

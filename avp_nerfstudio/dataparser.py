@@ -24,6 +24,8 @@ from avp_nerfstudio.selection import Order, chosen_views
 from avp_nerfstudio.verification import verify_pictures
 
 SPLITS = ("train", "val", "test")
+METRES_TO_SCENE = "metres_to_scene"
+"""In the metadata of all splits: units of the scene per metre, for methods whose options are in metres."""
 
 
 class UnusableRolloutError(RolloutError, SystemExit):
@@ -124,7 +126,9 @@ class AVPDataParser(DataParser):
             raise RolloutError(_no_heldout_views(parsed.rollout, split))
         poses = nerfstudio_poses([view.camera_to_world for view in views], scale=scale)
         box = scene_box(parsed.frames, parsed.seen, margin_m=self.config.box_margin_m) * scale
-        metadata = _depth_metadata(views) if self.config.depth else {}
+        metadata: dict[str, Any] = {METRES_TO_SCENE: scale}
+        if self.config.depth:
+            metadata |= _depth_metadata(views)
         if split == "train" and self._gives_points:
             metadata |= _point_metadata(subset(parsed.seen, self.config.initial_points), scale)
         return DataparserOutputs(
@@ -180,6 +184,7 @@ def _cameras(poses: NDArray[np.float32], intrinsics: Intrinsics) -> Cameras:
         width=intrinsics.width,
         height=intrinsics.height,
         camera_type=CameraType.PERSPECTIVE,
+        metadata={},  # `ns-export cameras` asserts that there is some
     )
 
 

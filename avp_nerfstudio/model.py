@@ -1,14 +1,22 @@
 """nerfacto for a room: bounded by the scene box, its hash encoding compiled, LPIPS optional."""
 
+import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from nerfstudio.cameras.rays import RayBundle
+import torch
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.model_components.scene_colliders import AABBBoxCollider
 from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
-from torch import Tensor
+from torch import Tensor, nn
+from tqdm import tqdm
 
+from avp_nerfstudio.carving import SurfaceGrid, measured_points
+from avp_nerfstudio.dataparser import METRES_TO_SCENE
+from avp_nerfstudio.depth_loss import termination_loss
 from avp_nerfstudio.hash_encoding import compile_hash_encodings
 from avp_nerfstudio.lpips import optional_lpips
 
@@ -20,6 +28,18 @@ class AVPNerfactoModelConfig(NerfactoModelConfig):
     _target: type = field(default_factory=lambda: AVPNerfactoModel)
     disable_scene_contraction: bool = True
     """Spend the hash tables on the scene box alone and end the rays at its walls: right for a room."""
+    view_dependent: bool = False
+    """Let colours change with the viewing direction. Habitat shows scenes without light, so theirs do not, and a
+    surface seen from one side only keeps its colour from the others; photographs want True."""
+    use_depth: bool = True
+    """Learn from the rollout's depth where it has some; False reconstructs from the pictures alone."""
+    depth_loss_mult: float = 0.005
+    """Weight of the loss that makes rays end at the measured depth."""
+    depth_tolerance_m: float = 0.05
+    """Half the thickness of the surfaces that this loss asks for, metres."""
+    carving_voxel_m: float = 0.05
+    """Keep space empty that is farther than two voxels of this edge from all measured points, metres; 0 carves
+    nothing. Without it, things float where no training ray has passed."""
 
 
 class SceneBoxCollider(AABBBoxCollider):
@@ -29,6 +49,19 @@ class SceneBoxCollider(AABBBoxCollider):
         """Set where the rays enter and leave the box, in units of the scene."""
         self.scene_box.aabb = self.scene_box.aabb.to(ray_bundle.origins.device)
         return super().set_nears_and_fars(ray_bundle)
+
+
+class NoDirections(nn.Module):
+    """Stands where the field encodes directions, and tells it nothing about them."""
+
+    def __init__(self, dimensions: int) -> None:
+        """Remember how many numbers the field expects."""
+        super().__init__()
+        self._dimensions = dimensions
+
+    def forward(self, directions: Tensor) -> Tensor:
+        """`(n, dimensions)` zeros for `(n, 3)` directions."""
+        return directions.new_zeros((len(directions), self._dimensions))
 
 
 class AVPNerfactoModel(NerfactoModel):
@@ -42,14 +75,97 @@ class AVPNerfactoModel(NerfactoModel):
             super().populate_modules()
         if self.config.disable_scene_contraction:
             self.collider = SceneBoxCollider(self.scene_box, near_plane=self.config.near_plane)
+        self.surfaces = SurfaceGrid(self.scene_box.aabb, (self.config.carving_voxel_m or 1.0) * self._scale)
+        self.density_fns = [functools.partial(self._proposed_density, density_fn) for density_fn in self.density_fns]
+        self.field.get_density = functools.partial(self._density, self.field.get_density)  # type: ignore[method-assign]
+        if not self.config.view_dependent:
+            dimensions = self.field.direction_encoding.get_out_dim()
+            self.field.direction_encoding = NoDirections(dimensions)  # type: ignore[assignment]
         if not self.config.predict_normals and self.config.camera_optimizer.mode == "off":
             compile_hash_encodings(self)
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Nerfacto's callbacks; before them, space is carved by the depth of the training's frames."""
+        pipeline = training_callback_attributes.pipeline
+        if self.config.use_depth and self.config.carving_voxel_m > 0 and pipeline is not None:
+            self._carve(pipeline.datamanager.train_dataset)
+        return super().get_training_callbacks(training_callback_attributes)
+
+    def _carve(self, dataset: Any) -> None:
+        if not dataset.metadata.get("depth_filenames"):
+            return
+        indices = tqdm(range(len(dataset)), desc="carving space by depth", unit="frame", leave=False, disable=None)
+        points = [
+            measured_points(dataset.cameras, i, dataset.get_metadata({"image_idx": i})["depth_image"]) for i in indices
+        ]
+        self.surfaces.fill(torch.cat(points).to(self.surfaces.low.device))
+
+    def _proposed_density(self, density_fn: Callable[..., Tensor], positions: Tensor, **options: Any) -> Tensor:
+        """A proposal network's density `(..., 1)` at `(..., 3)` positions, 0 in carved space without asking it."""
+        if not self.surfaces.carved:
+            return density_fn(positions, **options)
+        flat = positions.reshape(-1, 3)
+        solid = self.surfaces(flat).nonzero()[:, 0]
+        density = positions.new_zeros((len(flat), 1))
+        if len(solid):
+            density = density.index_copy(0, solid, density_fn(flat[solid][:, None], **options)[:, 0])
+        return density.view(*positions.shape[:-1], 1)
+
+    def _density(self, get_density: Callable[..., Any], ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
+        """The field's density and features, the density 0 in carved space."""
+        density, features = get_density(ray_samples)
+        if self.surfaces.carved:
+            density = density * self.surfaces(ray_samples.frustums.get_positions())[..., None]
+        return density, features
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        """Nerfacto's outputs and `planar_depth`, `(rays, 1)` in units of the scene, as a depth sensor measures it."""
+        outputs = super().get_outputs(ray_bundle)
+        directions_norm = ray_bundle.metadata["directions_norm"]
+        outputs["planar_depth"] = outputs["expected_depth"] / directions_norm
+        if self.training:
+            outputs["directions_norm"] = directions_norm
+        return outputs
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: dict[str, Tensor] | None = None
+    ) -> dict[str, Tensor]:
+        """Nerfacto's losses and, where there is depth, `depth_loss` over the field and the proposals."""
+        losses = super().get_loss_dict(outputs, batch, metrics_dict)
+        if self.training and self.config.use_depth and "depth_image" in batch:
+            losses["depth_loss"] = self.config.depth_loss_mult * self._depth_loss(outputs, batch["depth_image"])
+        return losses
+
+    def _depth_loss(self, outputs: dict[str, Any], planar_depth: Tensor) -> Tensor:
+        distance = (planar_depth.to(self.device) * outputs["directions_norm"])[..., 0]
+        tolerance = self.config.depth_tolerance_m * self._scale
+        terms = [
+            termination_loss(
+                weights[..., 0], samples.frustums.starts[..., 0], samples.frustums.ends[..., 0], distance, tolerance
+            )
+            for weights, samples in zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True)
+        ]
+        return torch.stack(terms).mean()
+
+    @property
+    def _scale(self) -> float:
+        """Units of the scene per metre."""
+        return float((self.kwargs.get("metadata") or {}).get(METRES_TO_SCENE, 1.0))
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """Nerfacto's metrics of a picture, without `lpips` where LPIPS is not computed."""
+        """Nerfacto's metrics of a picture, without `lpips` where LPIPS is not computed.
+
+        Where there is depth, `depth_error_m` is the median of the absolute error of planar depth in metres.
+        """
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         if math.isnan(metrics["lpips"]):
             del metrics["lpips"]
+        if "depth_image" in batch:
+            depth = batch["depth_image"].to(self.device)
+            error = (outputs["planar_depth"] - depth).abs()[depth > 0]
+            metrics["depth_error_m"] = float(error.median() / self._scale) if len(error) else math.nan
         return metrics, images

@@ -105,10 +105,17 @@ class AVPTrainer(Trainer):
                 address = address_of(self.config.mlflow, default=None) if comms.is_main_process() else None
                 client = connect(address) if address else None
                 super().setup(test_mode)
+                self._fit_schedules()
                 if comms.is_main_process():
                     self._trackers = Trackers.of(self.config, client, self.pipeline)
         except KeyboardInterrupt:
             raise SystemExit(INTERRUPTED) from None
+
+    def _fit_schedules(self) -> None:
+        """Let the learning rates reach their last values when the training ends, however long it is asked to be."""
+        for group in self.config.optimizers.values():
+            if hasattr(group["scheduler"], "max_steps"):
+                group["scheduler"].max_steps = self._start_step + self.config.max_num_iterations
 
     def train(self) -> None:
         """Train; Ctrl-C saves a checkpoint after the iteration it came in, and a second one ends at once."""

@@ -194,9 +194,9 @@ def test_a_fault_of_a_merged_rollout_names_its_file(pair):
 
 def test_without_depth_methods_see_neither_depth_nor_points_but_the_same_box(room):
     colours, everything = parse(room, depth=False), parse(room)
-    assert colours.metadata == {}
+    assert colours.metadata == {"metres_to_scene": 1.0}
     assert torch.equal(colours.scene_box.aabb, everything.scene_box.aabb)
-    assert parse(room, "val", depth=False).metadata == {}
+    assert parse(room, "val", depth=False).metadata == {"metres_to_scene": 1.0}
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from avp_habitat.motion import sensor_poses
-from avp_habitat.oracle.surfaces import surface_points
+from avp_habitat.oracle.surfaces import SURFACE_RANGE_M, surface_points
 from avp_habitat.poses import Intrinsics, pixel_directions
 from avp_habitat.settings import TaskSettings
 from avp_habitat.simulators.base import Simulator
@@ -135,7 +135,8 @@ def make_lattice(
     Args:
         simulator: of the scene.
         settings: of the task: sensor height, range, tolerance, length of a move.
-        beyond_floor: `(k, 3)` points on other surfaces that count like floor cells; none when omitted.
+        beyond_floor: `(k, 3)` points on other surfaces that count like floor cells once they are seen from near; none
+            when omitted.
         entries: most pairs of a place and a cell; the lattice's spacing is the smallest multiple of a cell that
             keeps below.
     """
@@ -145,7 +146,9 @@ def make_lattice(
     points = np.concatenate([area.centres, np.empty((0, 3)) if beyond_floor is None else beyond_floor])
     stride, cells = _stride(area.mask, entries // len(points))
     places = area.centres[cells]
-    sees = _unhidden(simulator, places, points, settings)
+    range_m = np.full(len(points), settings.max_range_m)
+    range_m[len(area.centres) :] = np.minimum(SURFACE_RANGE_M, settings.max_range_m)
+    sees = _unhidden(simulator, places, points, range_m, settings)
     grid = np.full(area.mask.shape, -1, dtype=np.int64)
     grid[tuple(np.argwhere(area.mask)[cells].T)] = np.arange(len(cells))
     other, length = kernels.neighbour_table(np.ascontiguousarray(grid[::stride, ::stride]), len(cells))
@@ -185,7 +188,7 @@ def _stride(mask: NDArray[np.bool_], most: int) -> tuple[int, NDArray[np.int64]]
             return stride, cells
 
 
-def _unhidden(simulator: Simulator, places: Float, points: Float, settings: TaskSettings) -> Bits:
+def _unhidden(simulator: Simulator, places: Float, points: Float, range_m: Float, settings: TaskSettings) -> Bits:
     ahead = np.zeros(len(places))
     pose = sensor_poses(settings, places, ahead, ahead)
     chunk = max(1, _RAYS_PER_CALL // len(points))
@@ -193,7 +196,7 @@ def _unhidden(simulator: Simulator, places: Float, points: Float, settings: Task
     for start in range(0, len(places), chunk):
         cameras = pose[start : start + chunk]
         distance = np.linalg.norm(points[None] - cameras[:, None, :3, 3], axis=-1)
-        pairs = np.argwhere(distance <= settings.max_range_m)
+        pairs = np.argwhere(distance <= range_m)
         reached = simulator.visible(cameras, points, pairs, tolerance_m=settings.tolerance_m)
         members = np.zeros(distance.shape, dtype=np.bool_)
         members[tuple(pairs[reached].T)] = True

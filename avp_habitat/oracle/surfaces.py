@@ -10,6 +10,8 @@ from avp_habitat.simulators.base import Simulator
 
 SPACING_M = 0.4
 """One point for each cube of this edge that holds some surface, metres."""
+SURFACE_RANGE_M = 4.0
+"""A surface counts as seen from this near, metres: from farther off its texture is too coarse to reconstruct."""
 _PLACES = 60
 _YAWS_DEG = (0.0, 90.0, 180.0, 270.0)
 _PITCHES_DEG = (-45.0, 0.0, 45.0)
@@ -35,7 +37,7 @@ def surface_points(simulator: Simulator, settings: TaskSettings) -> NDArray[np.f
         for k in range(len(pose)):
             points = unproject(depth[k], pose[k], _CAMERA)[(depth[k] > 0) & (depth[k] <= settings.max_range_m)]
             seen.append(_thinned(points[np.abs(points[:, 1] - place[1]) > _FLOOR_M]))
-    return _thinned(np.concatenate(seen))
+    return np.asarray(_thinned(np.concatenate(seen)), dtype=np.float64)
 
 
 def _thinned(points: NDArray[np.floating]) -> NDArray[np.floating]:
