@@ -67,6 +67,16 @@ def avp_nerfacto_rgb(config: Any) -> None:
     config.pipeline.model.use_depth = False
 
 
+def avp_nerfacto_uncarved(config: Any) -> None:
+    """The suite's method with depth in the loss only."""
+    config.pipeline.model.carving_voxel_m = 0.0
+
+
+def avp_nerfacto_view_dependent(config: Any) -> None:
+    """The suite's method with colours that change with the viewing direction."""
+    config.pipeline.model.view_dependent = True
+
+
 def nerfacto_defaults(config: Any) -> None:
     """Nerfacto as nerfstudio ships it, on a CPU."""
 
@@ -104,6 +114,8 @@ def _small(config: Any) -> None:
 WAYS: dict[str, tuple[str, Callable[[Any], None]]] = {
     "avp-nerfacto": ("avp-nerfacto", avp_nerfacto),
     "avp-nerfacto-rgb": ("avp-nerfacto", avp_nerfacto_rgb),
+    "avp-nerfacto-uncarved": ("avp-nerfacto", avp_nerfacto_uncarved),
+    "avp-nerfacto-view-dependent": ("avp-nerfacto", avp_nerfacto_view_dependent),
     "nerfacto-small": ("nerfacto", nerfacto_small),
     "nerfacto-boxed": ("nerfacto", nerfacto_boxed),
     "depth-nerfacto-small": ("depth-nerfacto", depth_nerfacto_small),
