@@ -44,12 +44,12 @@ def reconstruct(
     from nerfstudio.scripts import train as ns_train
     from nerfstudio.utils import writer
 
-    from avp_nerfstudio.config import set_iterations, trainer_config
+    from avp_nerfstudio.config import trainer_config
 
     config = trainer_config()
     config.data, config.output_dir = Path(data), Path(output_dir)
     if iterations is not None:
-        set_iterations(config, iterations)
+        config.max_num_iterations = iterations
     if edit is not None:
         edit(config)
     # nerfstudio keeps its writers for the life of a process: the last run's log must not get this run's events.

@@ -110,7 +110,8 @@ class Demo:
         runs, scores = self.folder / "reconstructions", self.folder / "scores" / f"{method}.json"
         name = ("--output-dir", runs, "--experiment-name", method, "--timestamp", "demo")
         length = ("--max-num-iterations", self.settings.iterations)
-        line = ("ns-train", "avp-nerfacto", "--data", rollout, *name, *length)
+        # The comparison below is what goes to MLflow, as children of one run.
+        line = ("ns-train", "avp-nerfacto", "--data", rollout, *name, *length, "--mlflow", "off")
         self.run(f"reconstruct {method}", *line, fresh=[runs / method])
         config = runs / method / "avp-nerfacto" / "demo" / "config.yml"
         scores.parent.mkdir(exist_ok=True)
