@@ -1,5 +1,7 @@
 """Space that the rollout's depth leaves for surfaces: a grid of voxels, empty wherever no frame has measured one."""
 
+from collections.abc import Iterable
+
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor, nn
@@ -46,17 +48,22 @@ class SurfaceGrid(nn.Module):
         return self.occupied[x, y, z] & inside
 
     @torch.no_grad()
-    def fill(self, points: Tensor) -> None:
-        """Leave matter only in the voxels of `(n, 3)` measured points and two voxels around them."""
-        index = torch.floor((points - self.low) / self.voxel).long()
-        shape = torch.tensor(self.occupied.shape, device=index.device)
-        index = index[((index >= 0) & (index < shape)).all(dim=-1)]
-        near = torch.zeros(self.occupied.shape, device=index.device)
-        near[index[:, 0], index[:, 1], index[:, 2]] = 1.0
+    def fill(self, frames: Iterable[Tensor]) -> None:
+        """Leave matter only in the voxels of measured points and two voxels around them.
+
+        Args:
+            frames: `(n, 3)` points each, units of the scene; one frame is held in memory at a time.
+        """
+        near = torch.zeros(self.occupied.shape, device=self.occupied.device)
+        shape = torch.tensor(self.occupied.shape, device=self.occupied.device)
+        for points in frames:
+            index = torch.floor((points.to(self.low.device) - self.low) / self.voxel).long()
+            index = index[((index >= 0) & (index < shape)).all(dim=-1)]
+            near[index[:, 0], index[:, 1], index[:, 2]] = 1.0
         near = nn.functional.max_pool3d(
             near[None, None], kernel_size=2 * _MARGIN_VOXELS + 1, stride=1, padding=_MARGIN_VOXELS
-        )[0, 0]
-        self.occupied.copy_(near > 0)
+        )
+        self.occupied.copy_(near[0, 0] > 0)
         self.carved.fill_(True)
 
 

@@ -97,10 +97,10 @@ class AVPNerfactoModel(NerfactoModel):
         if not dataset.metadata.get("depth_filenames"):
             return
         indices = tqdm(range(len(dataset)), desc="carving space by depth", unit="frame", leave=False, disable=None)
-        points = [
-            measured_points(dataset.cameras, i, dataset.get_metadata({"image_idx": i})["depth_image"]) for i in indices
-        ]
-        self.surfaces.fill(torch.cat(points).to(self.surfaces.low.device))
+        self.surfaces.fill(
+            measured_points(dataset.cameras, index, dataset.get_metadata({"image_idx": index})["depth_image"])
+            for index in indices
+        )
 
     def _proposed_density(self, density_fn: Callable[..., Tensor], positions: Tensor, **options: Any) -> Tensor:
         """A proposal network's density `(..., 1)` at `(..., 3)` positions, 0 in carved space without asking it."""
@@ -110,7 +110,7 @@ class AVPNerfactoModel(NerfactoModel):
         solid = self.surfaces(flat).nonzero()[:, 0]
         density = positions.new_zeros((len(flat), 1))
         if len(solid):
-            density = density.index_copy(0, solid, density_fn(flat[solid][:, None], **options)[:, 0])
+            density = density.index_copy(0, solid, density_fn(flat[solid][:, None], **options)[:, 0].to(density))
         return density.view(*positions.shape[:-1], 1)
 
     def _density(self, get_density: Callable[..., Any], ray_samples: RaySamples) -> tuple[Tensor, Tensor]:

@@ -42,7 +42,7 @@ def test_matter_is_left_around_measured_points_only():
     grid = SurfaceGrid(BOX, 0.1)
     everywhere = torch.tensor([[0.55, 0.05, 0.95], [1.9, -0.9, 0.1], [2.5, 0.0, 0.5]])
     assert grid(everywhere).tolist() == [True, True, False]
-    grid.fill(torch.tensor([[0.55, 0.05, 0.55], [9.0, 9.0, 9.0]]))
+    grid.fill([torch.tensor([[0.55, 0.05, 0.55]]), torch.tensor([[9.0, 9.0, 9.0]])])
     near = torch.tensor(
         [[0.55, 0.05, 0.55], [0.35, 0.25, 0.75], [0.85, 0.05, 0.55], [1.9, -0.9, 0.1], [0.55, 0.05, 1.2]]
     )
@@ -52,7 +52,7 @@ def test_matter_is_left_around_measured_points_only():
 
 def test_the_grid_is_part_of_the_checkpoint():
     filled, fresh = SurfaceGrid(BOX, 0.1), SurfaceGrid(BOX, 0.1)
-    filled.fill(torch.tensor([[0.5, 0.0, 0.5]]))
+    filled.fill([torch.tensor([[0.5, 0.0, 0.5]])])
     fresh.load_state_dict(filled.state_dict())
     assert bool(fresh.carved)
     assert torch.equal(fresh.occupied, filled.occupied)
