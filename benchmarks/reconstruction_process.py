@@ -172,7 +172,7 @@ def _train(config: Any, clock_of: Callable[[], Clock]) -> tuple[Any, Clock]:
     return trainer, clock
 
 
-def _score(trainer: Any, pictures: Path, views: Sequence[int]) -> list[dict[str, Any]]:
+def _score(trainer: Any, pictures: Path, views: Sequence[int], every: int) -> list[dict[str, Any]]:
     from avp_habitat.images import write_rgb
     from avp_nerfstudio.hash_encoding import compile_hash_encodings
     from avp_nerfstudio.heldout_pictures import to_8_bit
@@ -181,6 +181,8 @@ def _score(trainer: Any, pictures: Path, views: Sequence[int]) -> list[dict[str,
     trainer.pipeline.eval()
     # The compiled encoding gives the same colours (a test holds it to that), several times as fast.
     compile_hash_encodings(trainer.pipeline.model)
+    loader = trainer.pipeline.datamanager.fixed_indices_eval_dataloader
+    loader.image_indices = loader.image_indices[::every]
     rows = []
     for view in render_views(trainer.pipeline):
         rows.append({"view": view.index, **view.scores, "seconds": view.seconds})
@@ -199,6 +201,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--data", required=True, type=Path, help="the rollout")
     add("--seconds", default=0.0, type=float, help="time to train; 0 for no limit")
     add("--iterations", default=0, type=int, help="iterations to train; 0 for no limit")
+    add("--score-every", default=1, type=int, help="score every n-th held-out view only")
     add("--pictures", nargs="*", default=[], type=int, help="held-out views to keep as pictures")
     add("--output", required=True, type=Path, help="folder of the training; result.json and pictures go there")
     return made
@@ -216,7 +219,7 @@ def main(argv: Sequence[str]) -> None:
     np.random.seed(0)
     config = _config(options.way, options.data, options.output)
     trainer, clock = _train(config, lambda: Clock(config, options.seconds, options.iterations))
-    rows = _score(trainer, options.output / "pictures", options.pictures)
+    rows = _score(trainer, options.output / "pictures", options.pictures, options.score_every)
     names = [name for name in rows[0] if name not in ("view", "seconds")]
     result = {
         "iterations": clock.done,
