@@ -79,12 +79,15 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _facts(rollout: Rollout) -> dict[str, Any]:
-    meta, camera = rollout.meta, rollout.intrinsics
+    camera, meta = rollout.intrinsics, rollout.meta
+    scene, policy, metrics = (
+        part if isinstance(part, dict) else {} for part in map(meta.get, ("scene", "policy", "metrics"))
+    )
     return {
-        "scene": meta.get("scene", {}).get("name"),
-        "policy": meta.get("policy", {}).get("name"),
+        "scene": scene.get("name"),
+        "policy": policy.get("name"),
         "seed": meta.get("seed"),
-        "coverage": meta.get("metrics", {}).get("coverage"),
+        "coverage": metrics.get("coverage"),
         "frames": len(rollout.frames),
         "held_out": len(rollout.heldout),
         "pixels": f"{camera.width}x{camera.height}",

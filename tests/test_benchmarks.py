@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from nerfstudio_room import write_room
 
 from avp_habitat.poses import Intrinsics
 from avp_habitat.scenes.loader import load_scene
@@ -167,3 +168,30 @@ def test_subdividing_keeps_the_surface_closed_and_within_two_millimetres():
     assert np.linalg.norm(normal(fine), axis=1).sum() == pytest.approx(
         np.linalg.norm(normal(mesh), axis=1).sum(), rel=0.01
     )
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_the_dataparser_measures_both_splits(tmp_path):
+    words = ("--frames", 9, "--width", 32, "--height", 24, "--pictures", 4)
+    results = report(run("dataparser.py", *words, folder=tmp_path), tmp_path)
+    assert any(rows for rows in results.values())
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_reconstruction_trains_scores_and_does_nothing_twice(tmp_path, tmp_path_factory):
+    room, cells = write_room(tmp_path / "room"), tmp_path_factory.mktemp("cells")
+    words = ("--data", room, "--minutes", 0, "--iterations", 60, "--score-every", 2, "--pictures", 0)
+    words = (*words, "--ways", "avp-nerfacto", "nerfacto-tiny", "--cells", cells)
+    done = run("reconstruction.py", *words, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    results = json.loads((tmp_path / "report.json").read_text())["results"]
+    rows = results["60 iterations"]
+    assert [row["way"] for row in rows] == ["avp-nerfacto", "nerfacto-tiny"]
+    for row in rows:
+        positive(row, "train_s", "score_s", "memory_gb")
+        assert (row["iterations"], row["views"]) == (60, 1)
+        assert 3 < float(row["psnr_db"]) < 60
+    assert (tmp_path / "report.jpg").is_file()
+    made = {path: path.stat().st_mtime_ns for path in cells.rglob("result.json")}
+    run("reconstruction.py", *words, folder=tmp_path)
+    assert {path: path.stat().st_mtime_ns for path in cells.rglob("result.json")} == made
