@@ -76,6 +76,7 @@ def main(argv: Sequence[str]) -> None:
             if done is not None:
                 results.setdefault(cell.limit, []).append({"way": cell.way, **_row(done)})
         _picture(cells, options)
+        _write_markdown(results, options)
 
 
 def _facts(rollout: Rollout) -> dict[str, Any]:
@@ -126,6 +127,35 @@ def _row(done: dict[str, Any]) -> dict[str, Any]:
         "memory_gb": done["peak_memory_bytes"] / 1e9,
         "device": done["device"],
     }
+
+
+def _write_markdown(results: reporting.Results, options: argparse.Namespace) -> None:
+    """The tables and the picture as a page beside the report."""
+    machine, path = reporting.machine(), options.out.with_suffix(".md")
+    line = shlex.join(["python", "benchmarks/reconstruction.py", *sys.argv[1:]])
+    about = f"`{line}` at commit {reporting.git_commit()}; {machine['cpus']} CPUs ({machine['cpu_model']})"
+    threads = ", ".join(f"{name}={value}" for name, value in machine["threads"].items())
+    text = ["# Reconstructions of one rollout", "", f"{about}{f', {threads}' if threads else ''}; seed 0.", ""]
+    for title, rows in results.items():
+        keys = list(dict.fromkeys(key for row in rows for key in row))
+        cells = [[str(_short(row.get(key))) for key in keys] for row in rows]
+        text += [f"## {title}", "", f"| {' | '.join(keys)} |", f"|{' --- |' * len(keys)}"]
+        text += [*(f"| {' | '.join(line)} |" for line in cells), ""]
+    picture = options.out.with_suffix(".jpg")
+    if picture.exists():
+        text += [f"![Held-out views: the truth, and what each way makes of them]({picture.name})", ""]
+    path.write_text("\n".join(text), encoding="utf-8")
+    print(f"{path}: the tables")
+
+
+def _short(value: Any) -> Any:
+    if value is None:
+        return ""
+    return f"{value:,.4g}" if isinstance(value, float) and abs(value) < 1000 else _whole(value)
+
+
+def _whole(value: Any) -> Any:
+    return f"{value:,.0f}" if isinstance(value, int | float) else value
 
 
 def _picture(cells: Sequence[Cell], options: argparse.Namespace) -> None:

@@ -192,6 +192,7 @@ def test_the_benchmark_of_reconstruction_trains_scores_and_does_nothing_twice(tm
         assert (row["iterations"], row["views"]) == (60, 1)
         assert 3 < float(row["psnr_db"]) < 60
     assert (tmp_path / "report.jpg").is_file()
+    assert "| avp-nerfacto | 60 |" in (tmp_path / "report.md").read_text()
     made = {path: path.stat().st_mtime_ns for path in cells.rglob("result.json")}
     run("reconstruction.py", *words, folder=tmp_path)
     assert {path: path.stat().st_mtime_ns for path in cells.rglob("result.json")} == made
