@@ -1,4 +1,6 @@
+import gc
 import warnings
+import weakref
 
 import numpy as np
 import pytest
@@ -202,3 +204,13 @@ def test_the_frustum_of_the_tables_is_that_of_the_definition(room):
         if _in_view(views.camera_to_world[view], centres[cell], numbers, 4.0)
     ]
     assert found == [tuple(pair) for pair in expected.tolist()]
+
+
+def test_tables_live_as_long_as_their_simulator_and_no_longer():
+    simulator = make_simulator("raycast", "builtin:1")
+    tables = weakref.ref(scene_tables(simulator, SETTINGS))
+    gc.collect()
+    assert tables() is scene_tables(simulator, SETTINGS)
+    del simulator
+    gc.collect()
+    assert tables() is None

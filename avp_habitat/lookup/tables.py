@@ -71,7 +71,8 @@ class SceneTables:
             simulator: casts the rays.
             key: of the views.
         """
-        self._simulator = simulator
+        # Not held: the tables live as long as their simulator, whose users hold it.
+        self._simulator: RaySimulator = weakref.proxy(simulator)
         self.key = key
         self._samples = panorama.view_samples(key.intrinsics, key.pitches)
         self._directions = panorama.directions().reshape(-1, 3)
@@ -148,10 +149,7 @@ class SceneTables:
         return panorama.view_statistics(around, self._samples, self.key.max_range_m)
 
 
-# Tables hold their simulator, so the entry must not hold the tables: they live while someone's senses use them.
-_shared: weakref.WeakKeyDictionary[Simulator, weakref.WeakValueDictionary[ViewKey, SceneTables]] = (
-    weakref.WeakKeyDictionary()
-)
+_shared: weakref.WeakKeyDictionary[Simulator, dict[ViewKey, SceneTables]] = weakref.WeakKeyDictionary()
 
 
 def scene_tables(simulator: Simulator, settings: TaskSettings) -> SceneTables:
@@ -169,8 +167,7 @@ def scene_tables(simulator: Simulator, settings: TaskSettings) -> SceneTables:
         max_range_m=settings.max_range_m,
         tolerance_m=settings.tolerance_m,
     )
-    known = _shared.setdefault(simulator, weakref.WeakValueDictionary())
-    tables = known.get(key)
-    if tables is None:
-        tables = known[key] = SceneTables(simulator, key)
-    return tables
+    known = _shared.setdefault(simulator, {})
+    if key not in known:
+        known[key] = SceneTables(simulator, key)
+    return known[key]
