@@ -29,8 +29,8 @@ from PIL import Image
 from avp_nerfstudio.camera_path import Film, camera_path
 from avp_nerfstudio.checkpoints import allow_checkpoints
 
-WIDTH, HEIGHT, FRAMES, HELDOUT, ITERATIONS = 48, 36, 8, 2, 40
-SMALL = ["--pipeline.datamanager.train-num-rays-per-batch", 64, "--pipeline.model.log2-hashmap-size", 10]
+WIDTH, HEIGHT, FRAMES, HELDOUT, ITERATIONS = 48, 36, 8, 2, 200
+SMALL = ["--pipeline.datamanager.train-num-rays-per-batch", 128, "--pipeline.model.log2-hashmap-size", 10]
 PLAIN = [
     "nerfacto",
     "--machine.device-type",

@@ -70,7 +70,7 @@ def test_a_training_is_one_finished_run_with_losses_settings_versions_and_its_co
     assert run.data.metrics["eval/coverage"] == 0.5
     assert run.data.metrics["eval/views"] == 6
     assert run.data.params["pipeline.model.log2_hashmap_size"] == "8"
-    assert run.data.params["optimizers.fields.optimizer.lr"] == "0.01"
+    assert run.data.params["optimizers.fields.optimizer.lr"] == "0.02"
     assert run.data.params["rollout.seed"] == "3"
     assert run.data.tags["avp.scene"] == "a.glb"
     assert run.data.tags["avp.scene_digest"] == "00ff"
