@@ -3,12 +3,12 @@
 import dataclasses
 import math
 import re
-import subprocess
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from avp_habitat.provenance import flat, git_commit
 from avp_habitat.rollout import read_meta
 from avp_habitat.versions import installed_versions
 
@@ -95,29 +95,6 @@ def safe_name(name: str) -> str:
     """A name that MLflow takes: nerfstudio's brackets go, other unusual characters become `_`."""
     parts = _UNSAFE.sub("_", _BRACKETS.sub("", name)).split("/")
     return "/".join(part for part in parts if part not in ("", ".", ".."))[:_MAX_NAME] or "_"
-
-
-def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as one, keys joined by dots."""
-    leaves: dict[str, Any] = {}
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            leaves |= flat(value, f"{prefix}{key}.")
-        else:
-            leaves[f"{prefix}{key}"] = value
-    return leaves
-
-
-def git_commit() -> str | None:
-    """The commit checked out in the current folder; None outside a repository or without git."""
-    command = ["git", "rev-parse", "HEAD"]
-    try:
-        answer = subprocess.run(
-            command, capture_output=True, text=True, timeout=10, check=True, stdin=subprocess.DEVNULL
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return answer.stdout.strip()
 
 
 def _origin(meta: Mapping[str, Any]) -> dict[str, str]:

@@ -143,7 +143,8 @@ def _number(value: Any) -> float | None:
 
 def _json(results: Sequence[PolicyResult], about: Mapping[str, Any]) -> str:
     # Late: it imports torch, and a mistyped option should answer at once.
-    from avp_sb3.run_facts import PACKAGES, git_commit
+    from avp_habitat.provenance import git_commit
+    from avp_sb3.run_facts import PACKAGES
 
     value = {
         "format": FORMAT,

@@ -13,12 +13,13 @@ from mlflow.entities import Metric, Param, RunTag
 from mlflow.exceptions import MlflowException
 from mlflow.tracking.context.registry import resolve_tags
 
+from avp_habitat.provenance import flat, git_commit
 from avp_sb3.evaluation import PolicyResult
 from avp_sb3.evaluation_report import ReportError, summary
 from avp_sb3.evaluation_statistics import mean_and_half_width
 from avp_sb3.mlflow_callback import DEFAULT_TRACKING_URI
 from avp_sb3.mlflow_writer import safe_name
-from avp_sb3.run_facts import flat, git_commit, version_tags
+from avp_sb3.run_facts import version_tags
 
 _PREFIX = "eval"
 _MAX_PARAM = 6000

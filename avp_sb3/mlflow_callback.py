@@ -17,9 +17,10 @@ from mlflow.tracking.context.registry import resolve_tags
 from stable_baselines3.common.callbacks import BaseCallback
 
 from avp_habitat.errors import UsageError
+from avp_habitat.provenance import flat, git_commit
 from avp_sb3.finished_episodes import finished_episodes
 from avp_sb3.mlflow_writer import MLflowWriter, safe_name
-from avp_sb3.run_facts import flat, git_commit, hyperparameters, scene_tags, task_settings, version_tags
+from avp_sb3.run_facts import hyperparameters, scene_tags, task_settings, version_tags
 
 if TYPE_CHECKING:
     from avp_habitat.trajectory import Trajectory

@@ -2,13 +2,13 @@
 
 import dataclasses
 import inspect
-import subprocess
 from collections.abc import Mapping
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from avp_habitat.provenance import flat
 from avp_habitat.versions import installed_versions
 
 PACKAGES = ("avp-suite", "stable-baselines3", "torch", "gymnasium", "numpy", "open3d", "mlflow")
@@ -56,29 +56,6 @@ def scene_tags(env: VecEnv) -> dict[str, str]:
 def version_tags() -> dict[str, str]:
     """`version.PACKAGE` of Python and the packages that shape a training; packages that are absent are left out."""
     return {f"version.{name}": version for name, version in installed_versions(PACKAGES).items()}
-
-
-def git_commit() -> str | None:
-    """The commit checked out in the current folder; None outside a repository or without git."""
-    command = ["git", "rev-parse", "HEAD"]
-    try:
-        answer = subprocess.run(
-            command, capture_output=True, text=True, timeout=10, check=True, stdin=subprocess.DEVNULL
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return answer.stdout.strip()
-
-
-def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as one, keys joined by dots."""
-    leaves: dict[str, Any] = {}
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            leaves |= flat(value, f"{prefix}{key}.")
-        else:
-            leaves[f"{prefix}{key}"] = value
-    return leaves
 
 
 def _plain(value: Any) -> Any:

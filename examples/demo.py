@@ -163,7 +163,7 @@ def read_row(method: str, rollout: Path, scores: Path) -> tuple[Row, str | None]
 
 def write_table(folder: Path, rows: Sequence[Row], settings: Settings) -> str:
     """The comparison as Markdown, CSV and JSON in the folder; gives the Markdown."""
-    from avp_sb3.run_facts import git_commit
+    from avp_habitat.provenance import git_commit
 
     lines = [row.cells() for row in rows]
     titles = list(lines[0])

@@ -16,9 +16,9 @@ import numpy as np
 from tqdm import tqdm
 
 from avp_habitat import command
+from avp_habitat.provenance import git_commit
 from avp_habitat.rewards import RewardConstants
 from avp_habitat.settings import TaskSettings
-from avp_sb3.run_facts import git_commit
 
 EXPERIMENT = "avp-reward-search"
 VIEWS_WEIGHT = 0.3

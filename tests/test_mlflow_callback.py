@@ -13,8 +13,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from tracking import BreakingEnv, SmallEnv, mlflow_home, ppo
 
 from avp_habitat.errors import UsageError
+from avp_habitat.provenance import flat
 from avp_sb3 import MetricsCallback, MLflowCallback
-from avp_sb3.run_facts import flat, hyperparameters
+from avp_sb3.run_facts import hyperparameters
 
 TESTS = Path(__file__).parent
 

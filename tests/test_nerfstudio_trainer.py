@@ -15,8 +15,9 @@ from nerfstudio_training import tiny_config, train
 from rrd import entities, rows, verify
 
 from avp_habitat.errors import AVPError
+from avp_habitat.provenance import flat
 from avp_nerfstudio.interruption import Interruption
-from avp_nerfstudio.tracking_facts import Facts, facts_of, flat, rollout_folders, safe_name
+from avp_nerfstudio.tracking_facts import Facts, facts_of, rollout_folders, safe_name
 from avp_nerfstudio.tracking_mlflow import TrackingError, connect, open_run, shown
 from avp_nerfstudio.trainer import AVPTrainer, AVPTrainerConfig, TrainingError
 from avp_nerfstudio.training_progress import TrainingProgress
