@@ -13,7 +13,7 @@ from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.poses import Intrinsics
 from avp_sb3.finished_episodes import MissingInfoError, finished_episodes, required
 from avp_sb3.rerun_episode import EncodedView, encode_view, episode_of, log_episode, spread_indices
-from avp_sb3.rerun_recording import open_recording
+from avp_sb3.rerun_layout import open_recording
 
 if TYPE_CHECKING:
     from avp_habitat.navigation.area import NavigableArea

@@ -1,4 +1,4 @@
-"""Rerun recordings as files: how they are opened and laid out, and rollouts turned into one."""
+"""Rollouts as Rerun recordings."""
 
 import csv
 import os
@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from avp_habitat import images
@@ -16,37 +15,9 @@ from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.rollout import Rollout, read_rollout
 from avp_habitat.settings import ACTION_NAMES
 from avp_sb3.rerun_episode import EncodedView, Episode, encode_jpeg, log_episode
+from avp_sb3.rerun_layout import open_recording
 
-APPLICATION = "avp"
 _MAP_FILE = "trajectory.png"
-
-
-def layout(root: str, name: str, *, with_map: bool) -> rrb.Container:
-    """How a viewer arranges one root: the scene, beside it the camera, the map of a rollout and the plots."""
-    camera = f"{root}/world/camera"
-    maps = [rrb.Spatial2DView(origin=f"{root}/map", name="map")] if with_map else []
-    return rrb.Horizontal(
-        rrb.Spatial3DView(origin=f"{root}/world", name=name),
-        rrb.Vertical(
-            rrb.Horizontal(
-                rrb.Spatial2DView(origin=f"{camera}/rgb", name="RGB"),
-                rrb.Spatial2DView(origin=f"{camera}/depth", name="depth"),
-                *maps,
-            ),
-            rrb.TimeSeriesView(origin=f"{root}/plots/coverage", name="coverage"),
-            rrb.TimeSeriesView(origin=f"{root}/plots/reward", name="reward parts"),
-            rrb.TimeSeriesView(origin=f"{root}/plots/action", name="action"),
-        ),
-        column_shares=[3, 2],
-        name=name,
-    )
-
-
-def blueprint(roots: Sequence[str], *, with_map: bool = False) -> rrb.Blueprint:
-    """The layout of every root, in tabs when there are several, played by `step`."""
-    parts = [layout(root, root.strip("/") or "episode", with_map=with_map) for root in roots]
-    top = parts[0] if len(parts) == 1 else rrb.Tabs(*parts)
-    return rrb.Blueprint(top, rrb.TimePanel(timeline="step"), collapse_panels=True)
 
 
 def record_rollout(recording: rr.RecordingStream, rollout: Rollout, root: str = "") -> None:
@@ -112,18 +83,6 @@ def write_rollout_recording(folders: Sequence[Path], target: Path) -> Path:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
     return target
-
-
-def open_recording(path: Path, roots: Sequence[str], *, with_map: bool = False) -> rr.RecordingStream:
-    """A recording that is written to a file, with the layout of its roots; `disconnect()` finishes it.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    path.touch()  # Rerun's own error for an unwritable path has neither the path nor an errno.
-    recording = rr.RecordingStream(APPLICATION)
-    recording.save(path, default_blueprint=blueprint(roots, with_map=with_map))
-    return recording
 
 
 class _Steps:

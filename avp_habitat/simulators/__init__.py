@@ -7,7 +7,7 @@ from pathlib import Path
 from avp_habitat.errors import unknown_name
 from avp_habitat.simulators.base import Frames, Simulator
 
-__all__ = ["SIMULATOR_NAMES", "Frames", "Simulator", "make_simulator"]
+__all__ = ["SIMULATOR_NAMES", "Frames", "Simulator", "make_simulator", "open_scenes"]
 
 
 def _raycast(scene: str) -> Simulator:
@@ -51,3 +51,8 @@ def make_simulator(name: str, scene: str) -> Simulator:
         simulator = _FACTORIES[name](scene)
         _shared[key] = simulator
     return simulator
+
+
+def open_scenes() -> dict[str, str]:
+    """SHA-256 digests by name of the scenes that simulators of this process have open."""
+    return {simulator.scene: simulator.scene_digest for simulator in list(_shared.values())}

@@ -1,0 +1,48 @@
+"""Tags that every MLflow run gets while the suite is in use: the plug of group `mlflow.run_context_provider`."""
+
+import os
+import platform
+import sys
+
+from mlflow.tracking.context.abstract_context import RunContextProvider
+
+from avp_habitat.provenance import git_commit
+from avp_habitat.simulators import open_scenes
+from avp_habitat.versions import installed_versions
+
+PACKAGES = (
+    "avp-suite",
+    "stable-baselines3",
+    "nerfstudio",
+    "torch",
+    "gymnasium",
+    "numpy",
+    "open3d",
+    "mlflow",
+    "rerun-sdk",
+)
+_USERS = ("avp_habitat.env", "avp_sb3", "avp_nerfstudio")
+_MAX_TAG = 5000
+
+
+class AVPContext(RunContextProvider):
+    """System, package versions, git commit, and names and digests of the scenes that are open in this process."""
+
+    def in_context(self) -> bool:
+        """Whether this program uses the suite; installed alone, it must not mark other people's runs."""
+        return any(name in sys.modules for name in _USERS)
+
+    def tags(self) -> dict[str, str]:
+        """The tags."""
+        tags = {f"version.{name}": version for name, version in installed_versions(PACKAGES).items()}
+        tags |= {
+            "system.platform": platform.platform(),
+            "system.processor": platform.processor() or platform.machine(),
+            "system.cores": str(os.cpu_count()),
+        }
+        if (commit := git_commit()) is not None:
+            tags["mlflow.source.git.commit"] = commit
+        if scenes := open_scenes():
+            tags["avp.scene"] = ", ".join(scenes)[:_MAX_TAG]
+            tags["avp.scene_digest"] = ", ".join(scenes.values())[:_MAX_TAG]
+        return tags
