@@ -1,0 +1,151 @@
+"""Where MLflow keeps runs: the address that an option means, and a client of a store that answers."""
+
+import fcntl
+import hashlib
+import logging
+import os
+import re
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from avp_habitat.errors import AVPError
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+
+DEFAULT_ADDRESS = "sqlite:///mlflow.db"
+DEFAULT_EXPERIMENT = "avp"
+_PROBE_S = 5.0
+_ATTEMPTS = 5
+_SQLITE = "sqlite:///"
+
+
+class TrackingError(AVPError):
+    """An MLflow store that cannot be used, or does not take what it is given."""
+
+
+def address_of(option: str, *, default: str | None) -> str | None:
+    """The MLflow address that an option means.
+
+    Args:
+        option: an address, `auto` for `MLFLOW_TRACKING_URI`, or `off`.
+        default: of `auto` where that variable is not set.
+
+    Returns:
+        None for no tracking.
+    """
+    if option == "off":
+        return None
+    return os.environ.get("MLFLOW_TRACKING_URI") or default if option == "auto" else option
+
+
+def shown(address: str) -> str:
+    """An address without the user's name and password."""
+    return re.sub(r"//[^/@]*@", "//", address)
+
+
+def connect(address: str) -> "MlflowClient":
+    """A client of a store that answers.
+
+    Raises:
+        TrackingError: MLflow is not installed, or the store cannot be reached.
+    """
+    problem = unreachable(address)
+    if problem is not None:
+        raise _unusable(address, problem)
+    # A new database otherwise announces that it is made and each of its fifty migrations.
+    for name in ("alembic", "mlflow.store.db.utils"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    try:
+        from mlflow import MlflowClient
+
+        with _alone(address):
+            client = MlflowClient(address)
+            client.search_experiments(max_results=1)
+    except ImportError as error:
+        raise TrackingError(f"MLflow is asked for but not installed ({error}): pip install mlflow") from None
+    except Exception as error:
+        raise _unusable(address, _reason(address, error)) from None
+    return client
+
+
+def unreachable(address: str) -> str | None:
+    """Why the server of an address does not answer; None when it does, or when the address names no server.
+
+    MLflow itself tries again for minutes before it says so.
+    """
+    parts = urlsplit(address)
+    if parts.scheme not in ("http", "https"):
+        return None
+    try:
+        port = parts.port or (443 if parts.scheme == "https" else 80)
+        with socket.create_connection((parts.hostname or "", port), timeout=_PROBE_S):
+            return None
+    except (OSError, ValueError) as error:
+        return f"no server answers there ({getattr(error, 'strerror', None) or error})"
+
+
+def first_line(error: BaseException) -> str:
+    """An error's text without its tail of hints and stack frames."""
+    return str(error).strip().partition("\n")[0] or repr(error)
+
+
+def _reason(address: str, error: Exception) -> str:
+    """What MLflow's error means, where its own text would not help."""
+    line = first_line(error)
+    if "MLFLOW_ALLOW_FILE_STORE" in line:
+        return "MLflow 3 keeps runs in a folder only when the variable MLFLOW_ALLOW_FILE_STORE=true is set"
+    if "unsupported URI" in line:
+        known = line.partition("[")[2].partition("]")[0]
+        return f"unknown scheme {urlsplit(address).scheme!r}; MLflow knows {known}"
+    return line
+
+
+@contextmanager
+def _alone(address: str) -> Iterator[None]:
+    """Keeps other processes from making the same sqlite database at the same time, which would leave it half-made."""
+    if not address.startswith(_SQLITE):
+        yield
+        return
+    path = Path(address.removeprefix(_SQLITE)).absolute()
+    name = hashlib.sha256(os.fsencode(path)).hexdigest()[:16]
+    lock = Path(tempfile.gettempdir()) / f"avp-mlflow-{os.getuid()}-{name}.lock"
+    with lock.open("w") as file:
+        with suppress(OSError):
+            fcntl.lockf(file, fcntl.LOCK_EX)
+        yield
+
+
+def experiment_id(client: "MlflowClient", name: str) -> tuple[str, bool]:
+    """The id of an experiment, which is made when it does not exist, and whether it was made now.
+
+    Raises:
+        MlflowException: the store refuses.
+    """
+    from mlflow.exceptions import MlflowException
+
+    for attempt in range(_ATTEMPTS):
+        found = client.get_experiment_by_name(name)
+        if found is not None:
+            return found.experiment_id, False
+        try:
+            return client.create_experiment(name), True
+        except MlflowException:
+            # Another process may have been faster.
+            if attempt == _ATTEMPTS - 1:
+                raise
+            time.sleep(0.1)
+    raise AssertionError
+
+
+def _unusable(address: str, problem: str) -> TrackingError:
+    return TrackingError(
+        f"MLflow at {shown(address)} cannot be used: {problem}; expected an address such as {DEFAULT_ADDRESS} or "
+        "http://127.0.0.1:5000, or off"
+    )
