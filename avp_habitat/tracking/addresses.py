@@ -75,6 +75,18 @@ def connect(address: str) -> "MlflowClient":
     return client
 
 
+def absolute(address: str) -> str:
+    """An address that means the same in every folder."""
+    if address.startswith(_SQLITE):
+        return f"{_SQLITE}{Path(address.removeprefix(_SQLITE)).absolute()}"
+    return address if urlsplit(address).scheme else str(Path(address).absolute())
+
+
+def is_missing(address: str) -> bool:
+    """Whether an address names a database file that does not exist, which MLflow would make."""
+    return address.startswith(_SQLITE) and not Path(address.removeprefix(_SQLITE)).exists()
+
+
 def unreachable(address: str) -> str | None:
     """Why the server of an address does not answer; None when it does, or when the address names no server.
 

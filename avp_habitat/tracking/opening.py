@@ -1,0 +1,177 @@
+"""How a tracked run begins: as a new one, as one that goes on, or within one that is open already."""
+
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from uuid import uuid4
+
+from avp_habitat.tracking.addresses import DEFAULT_EXPERIMENT, TrackingError, absolute, connect, first_line, shown
+from avp_habitat.tracking.journal import VERSION, Journal, spool_folder
+from avp_habitat.tracking.remote import OFFLINE, create, existing_run, reopen
+from avp_habitat.tracking.run import TrackedRun
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+
+OFFLINE_VARIABLE = "AVP_MLFLOW_OFFLINE"
+
+
+@dataclass(frozen=True)
+class NewRun:
+    """What a run is made from."""
+
+    experiment: str = DEFAULT_EXPERIMENT
+    """Made when it does not exist."""
+    name: str | None = None
+    """Of the run; MLflow invents one when None."""
+    tags: Mapping[str, str] = field(default_factory=dict)
+    """Beside those of MLflow's run context."""
+    parent: str | None = None
+    """Id of the run below which MLflow shows this one, when both lie in one experiment."""
+
+
+def wants_offline(offline: bool | None) -> bool:
+    """Whether to go on without the server: as said, else as the variable `AVP_MLFLOW_OFFLINE` says."""
+    return os.environ.get(OFFLINE_VARIABLE, "") not in ("", "0") if offline is None else offline
+
+
+def start_run(
+    address: str, new: NewRun, *, offline: bool | None = None, spool: Path | None = None, **options: Any
+) -> TrackedRun:
+    """Begin a run.
+
+    Args:
+        address: of the store.
+        new: what the run is made from.
+        offline: True begins although the store does not answer; the run is made when it does. None: as
+            `AVP_MLFLOW_OFFLINE` says.
+        spool: folder of the journals; `spool_folder()` when None.
+        **options: of `TrackedRun`.
+
+    Raises:
+        TrackingError: the store cannot be reached (and `offline` is not set), or refuses.
+    """
+    from mlflow.tracking.context.registry import resolve_tags
+
+    client = _client(address, offline=wants_offline(offline))
+    header = _header(address) | {
+        "experiment": new.experiment,
+        "name": new.name,
+        "tags": resolve_tags() | dict(new.tags),
+        "parent": new.parent,
+        "creating": True,
+    }
+    journal = Journal.create(spool or spool_folder(), header)
+    if client is not None:
+        try:
+            journal.header["run_id"] = create(client, header | {"creating": False})
+            journal.save_header()
+        except OSError:
+            pass  # The journal says itself that the disk takes nothing.
+        except BaseException as error:
+            journal.remove()
+            if not isinstance(error, Exception):
+                raise
+            raise TrackingError(f"MLflow at {shown(address)} did not take the run: {first_line(error)}") from error
+    return TrackedRun(journal, client, **options)
+
+
+def continue_run(
+    address: str, run_id: str, *, offline: bool | None = None, spool: Path | None = None, **options: Any
+) -> TrackedRun:
+    """Go on with a run, with what its journal still holds when its process was killed.
+
+    Args:
+        address: of the store.
+        run_id: MLflow's, or the one given offline.
+        offline: as in `start_run`.
+        spool: as in `start_run`.
+        **options: of `TrackedRun`.
+
+    Raises:
+        TrackingError: the store cannot be reached (and `offline` is not set), or has no such run, or the run is being
+            written by another process.
+    """
+    home = spool or spool_folder()
+    client = _client(address, offline=wants_offline(offline))
+    journal = _left_journal(home, run_id)
+    if journal is not None:
+        journal.header |= {"address": absolute(address), "continue": True, "ended": None}
+        return _reopened(journal, client, uncertain=True, **options)
+    if client is None or run_id.startswith(OFFLINE):
+        if run_id.startswith(OFFLINE) and client is not None:
+            run_id = existing_run(client, run_id).info.run_id
+        elif run_id.startswith(OFFLINE):
+            raise TrackingError(f"MLflow run {run_id}: expected its journal in {home}, found none")
+    else:
+        run_id = existing_run(client, run_id).info.run_id
+    journal = Journal.create(home, _header(address) | {"run_id": run_id, "continue": True})
+    return _reopened(journal, client, **options)
+
+
+def join_run(address: str, run_id: str, *, spool: Path | None = None, **options: Any) -> TrackedRun:
+    """Fill a run that somebody else has opened and will end.
+
+    Args:
+        address: of the store.
+        run_id: of the run.
+        spool: as in `start_run`.
+        **options: of `TrackedRun`.
+
+    Raises:
+        TrackingError: the store cannot be reached or has no such run.
+    """
+    client = connect(address)
+    existing_run(client, run_id)
+    header = _header(address) | {"run_id": run_id, "owned": False}
+    return TrackedRun(Journal.create(spool or spool_folder(), header), client, **options)
+
+
+def _client(address: str, *, offline: bool) -> "MlflowClient | None":
+    try:
+        return connect(address)
+    except TrackingError as error:
+        if offline:
+            return None
+        raise TrackingError(
+            f"{error}; to go on without it and send everything later: offline=True, or {OFFLINE_VARIABLE}=1 set"
+        ) from None
+
+
+def _reopened(journal: Journal, client: "MlflowClient | None", **options: Any) -> TrackedRun:
+    if client is not None and journal.header["run_id"] is not None:
+        reopen(client, journal.header["run_id"])
+        journal.header["continue"] = False
+    return TrackedRun(journal, client, **options)
+
+
+def _header(address: str) -> dict[str, Any]:
+    return {
+        "version": VERSION,
+        "key": uuid4().hex,
+        "address": absolute(address),
+        "run_id": None,
+        "owned": True,
+        "ended": None,
+        "started_ms": int(time.time() * 1000),
+    }
+
+
+def _left_journal(spool: Path, run_id: str) -> Journal | None:
+    """The journal that a killed process left of this run.
+
+    Raises:
+        TrackingError: it is in use.
+    """
+    for folder in sorted(spool.glob("*")):
+        header = Journal.peek(folder)
+        if header is None or run_id not in (header["run_id"], f"{OFFLINE}{header['key']}"):
+            continue
+        journal = Journal.adopt(folder)
+        if journal is None:
+            raise TrackingError(f"MLflow run {run_id}: another program is writing it ({folder})")
+        return journal
+    return None

@@ -1,0 +1,135 @@
+"""The thread that tells MLflow what a journal holds, and keeps trying while MLflow does not answer."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+from avp_habitat.tracking.addresses import first_line, shown, unreachable
+from avp_habitat.tracking.delivery import Delivery
+from avp_habitat.tracking.journal import Journal
+
+INTERVAL_S = 5.0
+"""Time between two calls while a run lasts; each costs the training tens of milliseconds of Python."""
+_RETRY_S = (1.0, 15.0)
+_log = logging.getLogger(__name__)
+
+
+class Sender:
+    """Sends one journal's entries until it is stopped."""
+
+    def __init__(
+        self,
+        journal: Journal,
+        address: str,
+        open_delivery: Callable[[], Delivery],
+        *,
+        uncertain: bool,
+        interval_s: float = INTERVAL_S,
+    ) -> None:
+        """Describe the work.
+
+        Args:
+            journal: to empty.
+            address: of the store, for messages and to see whether a server answers at all.
+            open_delivery: makes the run when it does not exist yet; may fail and is then tried again.
+            uncertain: whether the first entries may have been sent by an earlier process.
+            interval_s: between two calls.
+        """
+        self._journal = journal
+        self._address = address
+        self._open_delivery = open_delivery
+        self._delivery: Delivery | None = None
+        self._uncertain = uncertain
+        self._interval_s = interval_s
+        self._hurry = threading.Event()
+        self._stopped = threading.Event()
+        self._idle = threading.Event()
+        self.problem: str | None = None
+        """Why nothing arrives just now."""
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Begin."""
+        # A daemon, so that an interpreter that exits without `close` is not held up; the journal keeps the rest.
+        self._thread = threading.Thread(target=self._work, name="avp-mlflow", daemon=True)
+        self._thread.start()
+
+    def drain(self, timeout_s: float) -> bool:
+        """Send everything without waiting for the interval; whether MLflow has it.
+
+        Args:
+            timeout_s: to wait at most without any progress; a store that does not answer is asked once more.
+        """
+        if self._thread is None:
+            return not self._journal
+        self._hurry.set()
+        try:
+            return self._wait_while_it_moves(timeout_s)
+        finally:
+            self._hurry.clear()
+
+    def stop(self, timeout_s: float = 5.0) -> bool:
+        """End the thread; whether it ended, which a call that hangs may prevent."""
+        self._stopped.set()
+        self._hurry.set()
+        if self._thread is None:
+            return True
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _wait_while_it_moves(self, timeout_s: float) -> bool:
+        until = time.monotonic() + timeout_s
+        left = self._journal.pending_bytes
+        while not self._journal.wait(0.2, for_entries=False):
+            if self._journal.pending_bytes < left:
+                left = self._journal.pending_bytes
+                until = time.monotonic() + timeout_s
+            if time.monotonic() > until or not (self._thread and self._thread.is_alive()):
+                return False
+        return True
+
+    def _work(self) -> None:
+        pause = _RETRY_S[0]
+        while not self._stopped.is_set():
+            if not self._journal.wait(1.0, for_entries=True):
+                continue
+            try:
+                self._send_some()
+            except Exception as error:
+                self._uncertain = True
+                self._failed(first_line(error))
+                self._stopped.wait(min(pause, 2.0) if self._hurry.is_set() else pause)
+                pause = min(2 * pause, _RETRY_S[1])
+                continue
+            self._worked()
+            pause = _RETRY_S[0]
+            self._hurry.wait(self._interval_s)
+
+    def _send_some(self) -> None:
+        if (problem := unreachable(self._address)) is not None:
+            raise ConnectionError(problem)
+        if self._delivery is None:
+            self._delivery = self._open_delivery()
+        batch = self._journal.read()
+        if batch is None:
+            return
+        self._delivery.send(batch.entries, uncertain=self._uncertain)
+        self._journal.acknowledge(batch)
+        self._uncertain = False
+        self._delivery.forget_files(batch.entries)
+
+    def _failed(self, reason: str) -> None:
+        if self.problem is None:
+            _log.warning(
+                "MLflow at %s does not take the run's points now (%s); they are kept%s and sent when it does",
+                shown(self._address),
+                reason,
+                "" if self._journal.folder is None else f" in {self._journal.folder}",
+            )
+        self.problem = reason
+
+    def _worked(self) -> None:
+        if self.problem is not None:
+            _log.warning("MLflow at %s takes the run's points again", shown(self._address))
+        self.problem = None
