@@ -1,0 +1,274 @@
+"""What an MLflow experiment's page shows: prepared views with the suite's columns and charts, and how to read them."""
+
+import base64
+import json
+import logging
+import time
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+
+VERSION = "1"
+VERSION_TAG = "avp.views"
+"""Tag of an experiment that has been prepared; with it, what people change or delete there stays as they left it."""
+VIEW_TAG = "mlflow.sharedViewState."
+NOTE_TAG = "mlflow.note.content"
+KIND_TAG = "mlflow.experimentKind"
+FIGURES = ("eval/views", "eval/coverage", "eval/psnr", "eval/ssim", "eval/lpips")
+"""What answers which policy gives the better reconstruction for fewer views."""
+
+_LOG = logging.getLogger(__name__)
+_MODEL_TRAINING = "workflowType=machine_learning"
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart of the page, one colour per run."""
+
+    title: str
+    """Shown above it."""
+    metric: str
+    """On its y axis."""
+    by: str | None = None
+    """Metric on its x axis; None for a bar per run, or the steps of a `line`."""
+    line: bool = False
+    """Whether it shows the course of the metric by step."""
+
+    def state(self, section: str, number: int) -> dict[str, Any]:
+        """As MLflow's page keeps it."""
+        common = {
+            "uuid": f"{section}-{number}",
+            "metricSectionId": section,
+            "deleted": False,
+            "isGenerated": False,
+            "displayName": self.title,
+            "runsCountToCompare": 100,
+        }
+        if self.by is not None:
+            axes = {"xaxis": {"key": self.by, "type": "METRIC"}, "yaxis": {"key": self.metric, "type": "METRIC"}}
+            return common | {"type": "SCATTER", **axes}
+        if not self.line:
+            return common | {"type": "BAR", "metricKey": self.metric}
+        steps = {
+            "xAxisKey": "step",
+            "selectedXAxisMetricKey": "",
+            "useGlobalXaxisKey": False,
+            "xAxisScaleType": "linear",
+        }
+        values = {"yAxisKey": "metric", "yAxisExpressions": [], "scaleType": "linear", "range": {}, "lineSmoothness": 0}
+        keys = {"metricKey": self.metric, "selectedMetricKeys": [self.metric], "useGlobalLineSmoothing": True}
+        return common | {"type": "LINE", **keys, **steps, **values}
+
+
+@dataclass(frozen=True)
+class View:
+    """A view of the runs page."""
+
+    key: str
+    """Names it in addresses."""
+    title: str
+    """In the page's menu of views."""
+    runs: str
+    """MLflow's search filter of the runs that it shows."""
+    columns: tuple[str, ...]
+    """Of its table, from left to right."""
+    sections: tuple[tuple[str, tuple[Chart, ...]], ...]
+    """Titled groups of charts, from top to bottom."""
+    order: str = "attributes.start_time"
+    """Column by which runs are sorted, the largest first."""
+
+    def state(self) -> dict[str, Any]:
+        """As MLflow's page keeps it."""
+        ids = [f"{self.key}-{number}" for number in range(len(self.sections))]
+        places = list(zip(ids, self.sections, strict=True))
+        shown = {"display": True, "isReordered": True, "deleted": False, "isGenerated": False}
+        return {
+            "searchFilter": self.runs,
+            "orderByKey": self.order,
+            "orderByAsc": False,
+            "startTime": "ALL",
+            "lifecycleFilter": "Active",
+            "datasetsFilter": [],
+            "modelVersionFilter": "All Runs",
+            "selectedColumns": list(self.columns),
+            "columnOrder": list(self.columns),
+            "columnWidths": {},
+            "runsExpanded": {},
+            "runsPinned": [],
+            "runsHidden": [],
+            "runsVisibilityMap": {},
+            "runsHiddenMode": "SHOW_ALL",
+            "viewMaximized": False,
+            "runListHidden": False,
+            "isAccordionReordered": True,
+            "useGroupedValuesInCharts": True,
+            "hideEmptyCharts": True,
+            "groupBy": None,
+            "groupsExpanded": {},
+            "autoRefreshEnabled": True,
+            "globalLineChartConfig": {"xAxisKey": "step", "lineSmoothness": 0, "selectedXAxisMetricKey": ""},
+            "chartsSearchFilter": "",
+            "compareRunSections": [{"uuid": key, "name": name, **shown} for key, (name, _) in places],
+            "compareRunCharts": [
+                chart.state(key, number) for key, (_, charts) in places for number, chart in enumerate(charts)
+            ],
+        }
+
+    def tag(self, created_ms: int) -> str:
+        """Value of the experiment's tag that holds it."""
+        state = json.dumps(self.state(), separators=(",", ":")).encode()
+        packed = "deflate;" + base64.b64encode(zlib.compress(state, 9)).decode("ascii")
+        return json.dumps({"name": self.title, "createdAt": created_ms, "state": packed})
+
+
+def _metric(name: str) -> str:
+    return f"metrics.`{name}`"
+
+
+def _tag(name: str) -> str:
+    return f"tags.`{name}`"
+
+
+_WHO = (_tag("avp.policy"), _tag("avp.scene"))
+RECONSTRUCTIONS = View(
+    key="avp-reconstructions",
+    title="Reconstructions by policy",
+    runs="metrics.`eval/psnr` > -1000",
+    columns=(*_WHO, *map(_metric, FIGURES), _tag("avp.method")),
+    sections=(
+        (
+            "Which policy gives the better reconstruction for fewer views: up and to the left is better",
+            (
+                Chart("PSNR [dB] by views", "eval/psnr", by="eval/views"),
+                Chart("PSNR [dB] by coverage", "eval/psnr", by="eval/coverage"),
+            ),
+        ),
+        (
+            "Reconstruction and its cost, a bar per run",
+            (
+                Chart("PSNR [dB]", "eval/psnr"),
+                Chart("views", "eval/views"),
+                Chart("coverage", "eval/coverage"),
+                Chart("SSIM", "eval/ssim"),
+                Chart("LPIPS, less is better", "eval/lpips"),
+            ),
+        ),
+    ),
+    order=_metric("eval/psnr"),
+)
+EVALUATIONS = View(
+    key="avp-evaluations",
+    title="Evaluations by policy",
+    runs="metrics.`eval/curve` >= 0",
+    columns=(
+        *_WHO,
+        *map(_metric, ("eval/views", "eval/coverage", "eval/coverage_ci95", "eval/cpv", "eval/stopped")),
+        _metric("eval/episodes"),
+    ),
+    sections=(
+        ("Coverage by view: steeper is better", (Chart("coverage after each view", "eval/curve", line=True),)),
+        (
+            "Figures of the episodes, a bar per policy",
+            (
+                Chart("coverage", "eval/coverage"),
+                Chart("views", "eval/views"),
+                Chart("CpV [% per view]", "eval/cpv"),
+            ),
+        ),
+    ),
+    order=_metric("eval/coverage"),
+)
+TRAININGS = View(
+    key="avp-trainings",
+    title="Trainings by environment step",
+    runs="metrics.`avp/coverage` >= 0",
+    columns=(
+        _tag("avp.scene"),
+        *map(_metric, ("avp/coverage", "avp/views", "avp/cpv", "rollout/ep_rew_mean", "time/fps")),
+        "params.`env.reward`",
+        "params.`env.observation`",
+        "params.`seed`",
+    ),
+    sections=(
+        (
+            "By environment step, means over the last episodes",
+            (
+                Chart("coverage", "avp/coverage", line=True),
+                Chart("views per episode", "avp/views", line=True),
+                Chart("CpV [% per view]", "avp/cpv", line=True),
+                Chart("return", "rollout/ep_rew_mean", line=True),
+                Chart("share of episodes that stop", "avp/stop_share", line=True),
+                Chart("redundant views per episode", "avp/redundant_views", line=True),
+            ),
+        ),
+        (
+            "Evaluations during the training, by environment step",
+            (
+                Chart("coverage on the evaluation's scenes", "eval/coverage", line=True),
+                Chart("views on the evaluation's scenes", "eval/views", line=True),
+            ),
+        ),
+    ),
+)
+VIEWS: Sequence[View] = (RECONSTRUCTIONS, EVALUATIONS, TRAININGS)
+"""In the order of the page's menu."""
+
+
+def path_of(experiment_id: str, view: View = RECONSTRUCTIONS, *, charts: bool = False) -> str:
+    """What follows the server's address, to open a view as a table or as `charts`."""
+    mode = "&compareRunsMode=CHART" if charts else ""
+    return f"#/experiments/{experiment_id}/runs?{_MODEL_TRAINING}&viewStateShareKey={view.key}{mode}"
+
+
+def prepare_experiment(client: "MlflowClient", experiment_id: str) -> str:
+    """Give an experiment its description and its views, once; later changes by people stay.
+
+    A store that refuses is a logged warning, because a training does not need its page; a version of MLflow that has
+    no such views leaves them alone.
+
+    Args:
+        client: of the store.
+        experiment_id: of an existing experiment.
+
+    Returns:
+        What follows the server's address, to open the reconstructions.
+    """
+    try:
+        present = client.get_experiment(experiment_id).tags
+        if present.get(VERSION_TAG) != VERSION:
+            for key, value in _tags(experiment_id, present).items():
+                client.set_experiment_tag(experiment_id, key, value)
+    except Exception as error:
+        _LOG.warning("MLflow experiment %s: its page could not be prepared: %s", experiment_id, error)
+    return path_of(experiment_id)
+
+
+def _tags(experiment_id: str, present: dict[str, str]) -> dict[str, str]:
+    """All tags that are wanted; the version comes last, so that a cut connection is made good by the next run."""
+    now = int(1000 * time.time())
+    # The menu shows the latest first.
+    views = {VIEW_TAG + view.key: view.tag(now - age) for age, view in enumerate(VIEWS)}
+    once = {NOTE_TAG: _note(experiment_id), KIND_TAG: "custom_model_development"}
+    return views | {key: value for key, value in once.items() if not present.get(key)} | {VERSION_TAG: VERSION}
+
+
+def _note(experiment_id: str) -> str:
+    table, charts = (path_of(experiment_id, charts=charts) for charts in (False, True))
+    return f"""\
+Which policy gives the better reconstruction for fewer views? [**Table**]({table}), [**charts**]({charts}).
+
+More views: [evaluations, coverage by view]({path_of(experiment_id, EVALUATIONS, charts=True)}), \
+[trainings by environment step]({path_of(experiment_id, TRAININGS, charts=True)}). All are in the menu *Views*, too.
+
+- `eval/views`: pictures taken; fewer is better.
+- `eval/coverage`: share of the floor that was seen, 0 to 1.
+- `eval/psnr` (dB, more is better), `eval/ssim` (more), `eval/lpips` (less): the reconstruction against views that \
+it never saw.
+- `avp.policy`, `avp.scene`: who took the pictures, and where.
+
+A table of the means by policy: `python -m avp_habitat.tracking.compare`, then the run *comparison*.
+"""
