@@ -12,15 +12,17 @@ from typing import Any
 from tqdm import tqdm
 
 from avp_habitat import command
+from avp_habitat.drawing import draw_trajectory
 from avp_habitat.errors import UsageError
 from avp_habitat.policies import POLICY_NAMES
 from avp_habitat.rewards import REWARD_NAMES
 from avp_habitat.settings import OBSERVATION_NAMES, TaskSettings
 from avp_habitat.simulators import SIMULATOR_NAMES
+from avp_habitat.trajectory import Trajectory
 from avp_sb3.evaluation import Contestant, EpisodeResult, PolicyResult, run_episodes
 from avp_sb3.evaluation_report import check_new, table, write_report
 
-EXPERIMENT = "avp-evaluation"
+EXPERIMENT = "avp"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -84,26 +86,36 @@ def main(argv: Sequence[str]) -> None:
         for policy in options.policy
     ]
     done: dict[str, list[EpisodeResult]] = {}
+    trajectories: dict[str, Trajectory] = {}
     try:
-        _run(contestants, options, done)
+        _run(contestants, options, done, trajectories)
     except KeyboardInterrupt:
-        _finish(contestants, done, options, argv, complete=False)
+        _finish(contestants, done, trajectories, options, argv, complete=False)
         raise
-    _finish(contestants, done, options, argv, complete=True)
+    _finish(contestants, done, trajectories, options, argv, complete=True)
 
 
-def _run(contestants: Sequence[Contestant], options: argparse.Namespace, done: dict[str, list[EpisodeResult]]) -> None:
+def _run(
+    contestants: Sequence[Contestant],
+    options: argparse.Namespace,
+    done: dict[str, list[EpisodeResult]],
+    trajectories: dict[str, Trajectory],
+) -> None:
+    """Fill in each policy's episodes, and the trajectory of its first one."""
     with tqdm(total=len(contestants) * options.episodes, unit="episode", disable=None) as progress:
         for contestant in contestants:
             progress.set_description(contestant.name)
             done[contestant.name] = []
             for episode in run_episodes(contestant, options.episodes, options.seed, progress.update):
                 done[contestant.name].append(episode)
+                if contestant.trajectory is not None:
+                    trajectories.setdefault(contestant.name, contestant.trajectory)
 
 
 def _finish(
     contestants: Sequence[Contestant],
     done: dict[str, list[EpisodeResult]],
+    trajectories: dict[str, Trajectory],
     options: argparse.Namespace,
     argv: Sequence[str],
     *,
@@ -119,16 +131,16 @@ def _finish(
         print(f"interrupted after {sum(len(result.seeds) for result in results)} episodes, which are kept")
     print(f"report:  {options.out}")
     if not options.no_mlflow:
-        _track(results, about, options, complete=complete)
+        area = contestants[0].env.area
+        pictures = {name: draw_trajectory(area, trajectory) for name, trajectory in trajectories.items()}
+        _track(results, about, options, complete=complete, pictures=pictures)
 
 
-def _track(
-    results: Sequence[PolicyResult], about: dict[str, Any], options: argparse.Namespace, *, complete: bool
-) -> None:
+def _track(results: Sequence[PolicyResult], about: dict[str, Any], options: argparse.Namespace, **more: Any) -> None:
     # Late: mlflow takes seconds to import.
     from avp_sb3.evaluation_tracking import track_evaluation
 
-    run, store = track_evaluation(results, about, options.out, experiment=options.experiment, complete=complete)
+    run, store = track_evaluation(results, about, options.out, experiment=options.experiment, **more)
     print(f"MLflow:  run {run} in experiment {options.experiment!r} at {store}")
 
 

@@ -1,6 +1,6 @@
 """Episodes of a policy on fixed starts, and the figures by which policies are compared."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,10 +12,13 @@ from avp_habitat.policies import Policy, check_policy, make_policy
 from avp_habitat.policy_env import make_policy_env
 from avp_habitat.settings import TaskSettings
 from avp_habitat.simulators import make_simulator
+from avp_habitat.trajectory import Trajectory
 from avp_sb3.evaluation_statistics import held_curve
 
 COVERAGE_AFTER = (20, 40, 60, 80)
 """Views after which the coverage is a figure of its own, as far as the budget reaches."""
+KEPT = ("coverage", "views", "annd_m", "ei", "path_length_m", "collisions", "stopped")
+"""Keys of `info["avp_episode"]` that are figures as they are."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,8 @@ class Contestant:
             SimulatorError: the simulator cannot run here.
         """
         self.name = check_policy(policy)
+        self.trajectory: Trajectory | None = None
+        """Of the last episode that ended."""
         self._stochastic = stochastic
         self.env, self._policy = make_policy_env(
             policy, make_simulator(simulator, scene), replace(settings, lookup=False), observation=observation
@@ -120,7 +125,8 @@ class Contestant:
         for step in steps:
             info = step.info
             coverage.append(info["coverage"])
-        return EpisodeResult(seed, *_figures(coverage, info["avp_episode"], self.env.settings.budget))
+        self.trajectory = info["avp_trajectory"]
+        return EpisodeResult(seed, *episode_figures(coverage, info["avp_episode"], self.env.settings.budget))
 
     def result(self, episodes: Sequence[EpisodeResult]) -> PolicyResult:
         """At least one episode of this policy, stacked."""
@@ -170,11 +176,19 @@ def run_episodes(
         on_episode()
 
 
-def _figures(coverage: list[float], episode: dict[str, float], budget: int) -> tuple[NDArray, dict[str, float]]:
+def episode_figures(
+    coverage: Sequence[float], episode: Mapping[str, float], budget: int
+) -> tuple[NDArray[np.float64], dict[str, float]]:
+    """An episode's curve and figures, as `EpisodeResult` holds them.
+
+    Args:
+        coverage: `(v,)` after each view, within [0, 1].
+        episode: `info["avp_episode"]`.
+        budget: T, at least v.
+    """
     curve = held_curve(coverage, budget)
-    kept = ("coverage", "views", "annd_m", "ei", "path_length_m", "collisions", "stopped")
     return curve, {
-        **{name: episode[name] for name in kept},
+        **{name: episode[name] for name in KEPT},
         "redundant_share": episode["redundant_views"] / episode["views"],
         "coverage_area": float(curve.mean()),
         **{f"coverage_at_{views}": float(curve[views - 1]) for views in COVERAGE_AFTER if views <= budget},

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from avp_habitat.errors import AVPError, UsageError
+from avp_habitat.metrics import coverage_per_view
 from avp_habitat.versions import installed_versions
 from avp_sb3.evaluation import PolicyResult
 from avp_sb3.evaluation_statistics import CONFIDENCE, mean_and_half_width
@@ -57,15 +58,27 @@ _SHOWN = {
 
 def table(results: Sequence[PolicyResult]) -> str:
     """Figures by policy as a Markdown table: mean ± half the 95 % confidence interval; no ± for one episode."""
+    rows = [["figure", *(result.policy for result in results)], *([name, *row] for name, row in cells(results).items())]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    padded = [[cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in rows]
+    padded.insert(1, ["-" * width for width in widths])
+    return "\n".join(f"| {' | '.join(row)} |" for row in padded)
+
+
+def cells(results: Sequence[PolicyResult]) -> dict[str, list[str]]:
+    """By the title of a figure, its text for each policy."""
     names = [name for name in _SHOWN if name in results[0].figures]
-    columns = [["figure", *(_SHOWN[name].title for name in names), "episodes"]]
-    for result in results:
-        cells = [_cell(_SHOWN[name], *mean_and_half_width(result.figures[name])) for name in names]
-        columns.append([result.policy, *cells, str(len(result.seeds))])
-    widths = [max(map(len, column)) for column in columns]
-    rows = [[cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in zip(*columns, strict=True)]
-    rows.insert(1, ["-" * width for width in widths])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    shown = {
+        _SHOWN[name].title: [_cell(_SHOWN[name], *mean_and_half_width(result.figures[name])) for result in results]
+        for name in names
+    }
+    episodes = [str(len(result.seeds)) for result in results]
+    return shown | {"CpV [%/view]": [f"{cpv(result):.2f}" for result in results], "episodes": episodes}
+
+
+def cpv(result: PolicyResult) -> float:
+    """Coverage per view in percent, of all episodes together."""
+    return coverage_per_view(result.figures["coverage"], result.figures["views"])
 
 
 def check_new(folder: Path) -> None:

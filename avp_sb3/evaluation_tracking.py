@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,20 +10,25 @@ from typing import Any
 import mlflow
 import numpy as np
 from mlflow import MlflowClient
-from mlflow.entities import Metric, Param, RunTag
+from mlflow.entities import Metric, Param
 from mlflow.exceptions import MlflowException
 from mlflow.tracking.context.registry import resolve_tags
+from numpy.typing import NDArray
 
 from avp_habitat.provenance import flat, git_commit
+from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, TrackingError, connect, experiment_id, first_line, shown
+from avp_habitat.tracking.names import safe_name
+from avp_habitat.tracking.view import COLOUR_TAG, NOTE_TAG, prepare_experiment, run_colour
 from avp_sb3.evaluation import PolicyResult
-from avp_sb3.evaluation_report import ReportError, summary
+from avp_sb3.evaluation_report import PLOT_FILE, ReportError, cells, cpv, summary, table
 from avp_sb3.evaluation_statistics import mean_and_half_width
-from avp_sb3.mlflow_callback import DEFAULT_TRACKING_URI
-from avp_sb3.mlflow_writer import safe_name
 from avp_sb3.run_facts import version_tags
 
+TABLE = "policies.json"
+"""Artifact of the upper run that MLflow's page shows as a table."""
+KIND_TAG, KIND = "avp.kind", "evaluation"
 _PREFIX = "eval"
-_MAX_PARAM = 6000
+_MAX_PARAM, _MAX_TAG = 6000, 5000
 
 
 def track_evaluation(
@@ -32,11 +38,14 @@ def track_evaluation(
     *,
     experiment: str,
     complete: bool = True,
+    pictures: Mapping[str, NDArray[np.uint8]] | None = None,
 ) -> tuple[str, str]:
     """Log an evaluation.
 
-    Each policy's run holds `eval/FIGURE` (the mean), `eval/FIGURE_ci95` (half of the interval) and, by view,
-    `eval/curve` with `eval/curve_ci95`.
+    The upper run holds the table of the policies and the plot of their curves. Each policy's run holds `eval/FIGURE`
+    (the mean), `eval/FIGURE_ci95` (half of the interval), `eval/cpv`, its picture and, by view, `eval/curve` with
+    `eval/curve_ci95`. The run that trained a policy is its tag `avp.policy_run`, because a run of MLflow has one
+    parent only.
 
     Args:
         results: of the policies.
@@ -44,57 +53,94 @@ def track_evaluation(
         folder: of the report; its files become artifacts of the upper run.
         experiment: MLflow experiment, made when it does not exist.
         complete: False marks the runs as interrupted.
+        pictures: `(h, w, 3)` by policy, for those that have one.
 
     Raises:
         ReportError: MLflow failed; the report is on disk.
 
     Returns:
-        The upper run's id and the address of the store: what is configured, else `sqlite:///mlflow.db`.
+        The upper run's id and the address of the store without a password: what is configured, else
+        `sqlite:///mlflow.db`.
     """
+    address = mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else DEFAULT_ADDRESS
     try:
-        return _log(results, about, folder, experiment, "FINISHED" if complete else "KILLED")
-    except (MlflowException, OSError) as error:
-        raise ReportError(f"the report is in {folder}, but MLflow did not take it: {error}") from error
+        client = connect(address)
+        identity, _ = experiment_id(client, experiment)
+        prepare_experiment(client, identity)
+        parent = _log(client, identity, results, about, folder, "FINISHED" if complete else "KILLED", pictures or {})
+    except (MlflowException, TrackingError, OSError) as error:
+        raise ReportError(f"the report is in {folder}, but MLflow did not take it: {first_line(error)}") from error
+    return parent, shown(address)
 
 
 def _log(
-    results: Sequence[PolicyResult], about: Mapping[str, Any], folder: Path, experiment: str, status: str
-) -> tuple[str, str]:
-    client = MlflowClient(mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else DEFAULT_TRACKING_URI)
-    found = client.get_experiment_by_name(experiment)
-    identity = found.experiment_id if found else client.create_experiment(experiment)
+    client: MlflowClient,
+    experiment: str,
+    results: Sequence[PolicyResult],
+    about: Mapping[str, Any],
+    folder: Path,
+    status: str,
+    pictures: Mapping[str, NDArray[np.uint8]],
+) -> str:
+    tags = _tags(about)
+    params = [Param(safe_name(name), str(value)[:_MAX_PARAM]) for name, value in flat(about).items()]
+    parent = client.create_run(experiment, run_name="evaluation", tags=tags | {KIND_TAG: KIND}).info.run_id
+    client.log_batch(parent, params=params)
+    names = _names(results)
+    for result, name in zip(results, names, strict=True):
+        own = {"mlflow.parentRunId": parent, "avp.policy": name, COLOUR_TAG: run_colour(name)}
+        own |= {"avp.policy_run": result.training_run} if result.training_run else {}
+        run = client.create_run(experiment, run_name=name, tags=tags | own).info.run_id
+        more = [Param("policy", result.policy), Param("observation", str(result.observation))]
+        client.log_batch(run, metrics=_metrics(result), params=[*params, *more])
+        if result.policy in pictures:
+            client.log_image(run, pictures[result.policy], key=f"{_PREFIX}/trajectory", step=0)
+        client.set_terminated(run, status)
+    _log_table(client, parent, results, names)
+    client.log_artifacts(parent, os.fspath(folder))
+    _log_plot(client, parent, folder / PLOT_FILE)
+    client.set_terminated(parent, status)
+    return parent
+
+
+def _tags(about: Mapping[str, Any]) -> dict[str, str]:
     tags = dict(resolve_tags()) | version_tags()
     if (commit := git_commit()) is not None:
         tags["mlflow.source.git.commit"] = commit
-    params = _params(about)
-    parent = client.create_run(identity, run_name="evaluation", tags=tags).info.run_id
-    client.log_batch(parent, params=params)
-    for result in results:
-        own = {"mlflow.parentRunId": parent} | ({"avp.policy_run": result.training_run} if result.training_run else {})
-        run = client.create_run(identity, run_name=_run_name(result.policy), tags=tags | own).info.run_id
-        client.log_batch(
-            run,
-            metrics=_metrics(result),
-            params=[*params, Param("policy", result.policy), Param("observation", str(result.observation))],
-            tags=[RunTag("avp.policy", result.policy)],
-        )
-        client.set_terminated(run, status)
-    client.log_artifacts(parent, os.fspath(folder))
-    client.set_terminated(parent, status)
-    return parent, client.tracking_uri
+    scene = about.get("scene")
+    if isinstance(scene, Mapping):
+        named = {"avp.scene": scene.get("name"), "avp.scene_digest": scene.get("sha256")}
+        tags |= {key: str(value) for key, value in named.items() if value is not None}
+    return tags
 
 
-def _params(about: Mapping[str, Any]) -> list[Param]:
-    return [Param(safe_name(name), str(value)[:_MAX_PARAM]) for name, value in flat(about).items()]
+def _names(results: Sequence[PolicyResult]) -> list[str]:
+    """The policies' names as rollouts have them, or as they were given where two would be the same."""
+    short = [Path(result.policy).name for result in results]
+    count = Counter(short)
+    return [name if count[name] == 1 else result.policy for name, result in zip(short, results, strict=True)]
 
 
-def _run_name(policy: str) -> str:
-    return Path(policy).name
+def _log_table(client: MlflowClient, run: str, results: Sequence[PolicyResult], names: Sequence[str]) -> None:
+    """The policies as rows of a table, and as the text that the page shows above everything else."""
+    client.log_table(run, {"policy": list(names), **cells(results)}, TABLE)
+    client.set_tag(run, NOTE_TAG, f"{table(results)}\n\nMean ± half of the 95 % interval over the episodes."[:_MAX_TAG])
+
+
+def _log_plot(client: MlflowClient, run: str, path: Path) -> None:
+    """Once more as a picture by step, because only such appear among the charts."""
+    from avp_habitat.images import read_rgb
+
+    if path.is_file():
+        client.log_image(run, read_rgb(path), key=f"{_PREFIX}/coverage_by_view", step=0)
 
 
 def _metrics(result: PolicyResult) -> list[Metric]:
     now = int(time.time() * 1000)
-    metrics = [Metric(f"{_PREFIX}/episodes", float(len(result.seeds)), now, 0)]
+    metrics = [
+        Metric(f"{_PREFIX}/episodes", float(len(result.seeds)), now, 0),
+        Metric(f"{_PREFIX}/cpv", cpv(result), now, 0),
+    ]
     for name, values in summary(result).items():
         metrics += _pair(f"{_PREFIX}/{name}", values["mean"], values["half_width"], now, 0)
     mean, half = mean_and_half_width(result.curve)

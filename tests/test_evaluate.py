@@ -2,9 +2,12 @@ import csv
 import json
 import os
 import re
+import shutil
 import signal
 from dataclasses import replace
+from pathlib import Path
 
+import mlflow
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,8 +18,11 @@ from stable_baselines3 import PPO
 from tracking import mlflow_home
 
 from avp_habitat import command
+from avp_habitat.drawing import draw_trajectory
 from avp_habitat.env import AVPEnv
+from avp_habitat.episode import steps_of
 from avp_habitat.errors import PolicyError
+from avp_habitat.images import read_rgb
 from avp_habitat.policies import make_policy
 from avp_habitat.rewards import RewardConstants
 from avp_habitat.settings import TaskSettings
@@ -161,6 +167,10 @@ def test_the_table_shows_means_with_their_intervals_in_percent():
     assert coverage[1] == f"{mean:.1f} ± {half:.1f}"
     assert re.fullmatch(r"\d+\.\d", coverage[2])
     assert rows[-1] == ["episodes", "3", "1"]
+    assert rows[-2][:2] == [
+        "CpV [%/view]",
+        f"{100 * mine.figures['coverage'].mean() / mine.figures['views'].mean():.2f}",
+    ]
     assert summary(result("one", 1))["ei"]["half_width"] is None
 
 
@@ -181,17 +191,65 @@ def test_the_command_compares_writes_and_logs(tmp_path, monkeypatch, capsys, mod
     assert (tmp_path / "report" / "table.md").read_text().strip() in printed
 
     client = MlflowClient()
-    experiment = client.get_experiment_by_name("avp-evaluation").experiment_id
+    experiment = client.get_experiment_by_name("avp").experiment_id
     parent = re.search(r"run (\w+) in experiment", printed)[1]
     assert {item.path for item in client.list_artifacts(parent)} >= {"evaluation.json", "coverage.png"}
+    assert client.get_run(parent).data.metrics == {}
+    table = mlflow.artifacts.load_dict(f"runs:/{parent}/policies.json")
+    rows = [dict(zip(table["columns"], row, strict=True)) for row in table["data"]]
+    assert [(row["policy"], row["episodes"]) for row in rows] == [("heuristic", "2"), ("model.zip", "2")]
+    for row, policy in zip(rows, report["policies"], strict=True):
+        views = np.mean([episode["views"] for episode in policy["episodes"]])
+        coverage = np.mean([episode["coverage"] for episode in policy["episodes"]])
+        assert row["CpV [%/view]"] == f"{100 * coverage / views:.2f}"
+        assert row["coverage [%]"].startswith(f"{100 * coverage:.1f} ± ")
     runs = client.search_runs([experiment], f"tags.`mlflow.parentRunId` = '{parent}'")
     assert {run.data.params["policy"] for run in runs} == {"heuristic", model}
     learned = next(run for run in runs if run.data.params["policy"] == model)
     assert learned.data.tags["avp.policy_run"] == "f00d"
+    assert learned.info.run_name == learned.data.tags["avp.policy"] == "model.zip"
+    assert learned.data.tags["avp.scene"] == "builtin:0"
     entry = report["policies"][1]
     assert learned.data.metrics["eval/coverage"] == pytest.approx(entry["summary"]["coverage"]["mean"])
     curve = client.get_metric_history(learned.info.run_id, "eval/curve")
     assert [(point.step, point.value) for point in curve] == list(enumerate(entry["curve"]["mean"], start=1))
+    figures = {name: values["mean"] for name, values in entry["summary"].items()}
+    assert learned.data.metrics["eval/cpv"] == pytest.approx(100 * figures["coverage"] / figures["views"])
+    drawn = logged_picture(client, learned.info.run_id, tmp_path / "drawn")
+    env = AVPEnv("builtin:0", settings=replace(SETTINGS, observation="map"))
+    steps = list(steps_of(env, PPO.load(model), seed=1000))
+    np.testing.assert_array_equal(drawn, draw_trajectory(env.area, steps[-1].info["avp_trajectory"]))
+    assert logged_picture(client, parent, tmp_path / "plot").shape == read_rgb(tmp_path / "report/coverage.png").shape
+
+
+def logged_picture(client, run, folder):
+    """The picture that MLflow's page shows; next to it lies a compressed one."""
+    folder.mkdir()
+    (path,) = (file.path for file in client.list_artifacts(run, "images") if file.path.endswith(".png"))
+    return read_rgb(Path(client.download_artifacts(run, path, folder)))
+
+
+def test_two_models_of_one_file_name_stay_apart(tmp_path, monkeypatch, capsys, model):
+    mlflow_home(tmp_path, monkeypatch)
+    paths = []
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        paths.append(shutil.copy(model, f"{name}/model.zip"))
+    assert evaluate("--policy", paths[0], "--policy", paths[1], "--episodes", 1) == 0
+    client = MlflowClient()
+    found = client.search_runs([client.get_experiment_by_name("avp").experiment_id], "tags.`avp.policy` != ''")
+    assert {run.data.tags["avp.policy"] for run in found} == set(paths)
+
+
+def test_a_store_that_does_not_answer_leaves_the_report(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(mlflow, "get_tracking_uri", lambda: "http://me:secret@127.0.0.1:9")
+    monkeypatch.setattr(mlflow, "is_tracking_uri_set", lambda: True)
+    assert evaluate("--policy", "spin", "--episodes", 1, "--out", "kept") == 1
+    error = capsys.readouterr().err.strip()
+    assert error.startswith("error: the report is in kept, but MLflow did not take it: MLflow at http://127.0.0.1:9 ")
+    assert "secret" not in error
+    assert read_report(tmp_path / "kept")[0].policy == "spin"
 
 
 @pytest.mark.parametrize(

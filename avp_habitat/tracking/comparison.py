@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from avp_habitat.intervals import mean_and_half_width
 from avp_habitat.metrics import coverage_per_view
+from avp_habitat.tracking.view import run_colour
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -139,7 +140,8 @@ def picture(methods: Sequence[Method], path: Path) -> bool:
     for method in shown:
         views, psnr = method.means[_VIEWS], method.means[_PSNR]
         spread = method.halves.get(_PSNR), method.halves.get(_VIEWS)
-        axes.errorbar(views, psnr, *spread, fmt="o", capsize=3, label=_label(method, shown))
+        colour = run_colour(method.policy)
+        axes.errorbar(views, psnr, *spread, fmt="o", capsize=3, color=colour, label=_label(method, shown))
     axes.set(xlabel="views (fewer is better)", ylabel="PSNR [dB] on held-out views", title="up and left is better")
     axes.margins(0.12)
     axes.grid(alpha=0.3)

@@ -1,6 +1,7 @@
 """What an MLflow experiment's page shows: prepared views with the suite's columns and charts, and how to read them."""
 
 import base64
+import hashlib
 import json
 import logging
 import time
@@ -18,9 +19,20 @@ VERSION_TAG = "avp.views"
 VIEW_TAG = "mlflow.sharedViewState."
 NOTE_TAG = "mlflow.note.content"
 KIND_TAG = "mlflow.experimentKind"
-FIGURES = ("eval/views", "eval/coverage", "eval/psnr", "eval/ssim", "eval/lpips")
+COLOUR_TAG = "mlflow.runColor"
+FIGURES = ("eval/psnr", "eval/views", "eval/coverage", "eval/ssim", "eval/lpips")
 """What answers which policy gives the better reconstruction for fewer views."""
 
+_COLOURS = {
+    "heuristic": "#7f7f7f",
+    "random": "#bcbd22",
+    "spin": "#8c564b",
+    "frontier": "#17becf",
+    "greedy": "#1f77b4",
+    "oracle": "#9467bd",
+    "survey": "#e377c2",
+}
+_MODEL_COLOURS = ("#d62728", "#ff7f0e", "#2ca02c", "#a55194", "#637939", "#843c39", "#e7969c", "#e7ba52")
 _LOG = logging.getLogger(__name__)
 _MODEL_TRAINING = "workflowType=machine_learning"
 
@@ -138,17 +150,17 @@ RECONSTRUCTIONS = View(
     key="avp-reconstructions",
     title="Reconstructions by policy",
     runs="metrics.`eval/psnr` > -1000",
-    columns=(*_WHO, *map(_metric, FIGURES), _tag("avp.method")),
+    columns=(_tag("avp.policy"), *map(_metric, FIGURES), _tag("avp.scene"), _tag("avp.method")),
     sections=(
         (
-            "Which policy gives the better reconstruction for fewer views: up and to the left is better",
+            "Up and left is better",
             (
                 Chart("PSNR [dB] by views", "eval/psnr", by="eval/views"),
                 Chart("PSNR [dB] by coverage", "eval/psnr", by="eval/coverage"),
             ),
         ),
         (
-            "Reconstruction and its cost, a bar per run",
+            "A bar per run",
             (
                 Chart("PSNR [dB]", "eval/psnr"),
                 Chart("views", "eval/views"),
@@ -170,9 +182,9 @@ EVALUATIONS = View(
         _metric("eval/episodes"),
     ),
     sections=(
-        ("Coverage by view: steeper is better", (Chart("coverage after each view", "eval/curve", line=True),)),
+        ("Coverage by view", (Chart("coverage after each view", "eval/curve", line=True),)),
         (
-            "Figures of the episodes, a bar per policy",
+            "A bar per policy",
             (
                 Chart("coverage", "eval/coverage"),
                 Chart("views", "eval/views"),
@@ -195,7 +207,7 @@ TRAININGS = View(
     ),
     sections=(
         (
-            "By environment step, means over the last episodes",
+            "By environment step",
             (
                 Chart("coverage", "avp/coverage", line=True),
                 Chart("views per episode", "avp/views", line=True),
@@ -206,7 +218,7 @@ TRAININGS = View(
             ),
         ),
         (
-            "Evaluations during the training, by environment step",
+            "Evaluations by environment step",
             (
                 Chart("coverage on the evaluation's scenes", "eval/coverage", line=True),
                 Chart("views on the evaluation's scenes", "eval/views", line=True),
@@ -222,6 +234,12 @@ def path_of(experiment_id: str, view: View = RECONSTRUCTIONS, *, charts: bool = 
     """What follows the server's address, to open a view as a table or as `charts`."""
     mode = "&compareRunsMode=CHART" if charts else ""
     return f"#/experiments/{experiment_id}/runs?{_MODEL_TRAINING}&viewStateShareKey={view.key}{mode}"
+
+
+def run_colour(policy: str) -> str:
+    """The colour (`#rrggbb`) of a policy's runs on the page: the same in each run, its own for each baseline."""
+    place = hashlib.sha256(policy.encode()).digest()[0] % len(_MODEL_COLOURS)
+    return _COLOURS.get(policy, _MODEL_COLOURS[place])
 
 
 def prepare_experiment(client: "MlflowClient", experiment_id: str) -> str:
