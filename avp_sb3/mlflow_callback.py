@@ -1,47 +1,37 @@
 """A training of Stable-Baselines3 as an MLflow run."""
 
 import atexit
-import os
+import json
+import logging
 import sys
-import tempfile
-import warnings
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import mlflow
-from mlflow import MlflowClient
-from mlflow.entities import Param, RunTag
-from mlflow.tracking.context.registry import resolve_tags
 from stable_baselines3.common.callbacks import BaseCallback
 
 from avp_habitat.errors import UsageError
-from avp_habitat.provenance import flat, git_commit
+from avp_habitat.provenance import flat
+from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, DEFAULT_EXPERIMENT, shown
+from avp_habitat.tracking.journal import spool_folder
+from avp_habitat.tracking.opening import NewRun, continue_run, join_run, may_continue, start_run
+from avp_habitat.tracking.recovery import Recovered, recover_in_background
+from avp_habitat.tracking.run import Status, TrackedRun
 from avp_sb3.finished_episodes import finished_episodes
-from avp_sb3.mlflow_writer import MLflowWriter, safe_name
-from avp_sb3.run_facts import hyperparameters, scene_tags, task_settings, version_tags
+from avp_sb3.learning import is_learning
+from avp_sb3.mlflow_writer import MLflowWriter
+from avp_sb3.run_facts import hyperparameters, scene_tags, task_settings
 
 if TYPE_CHECKING:
     from avp_habitat.trajectory import Trajectory
 
-Status = Literal["FINISHED", "FAILED", "KILLED"]
-
-DEFAULT_TRACKING_URI = "sqlite:///mlflow.db"
 MODEL_FILE = "model.zip"
+PARAMS_FILE = "params.json"
 TRAJECTORY_FILE = "trajectory.png"
-_MAX_PARAM = 6000
-
-
-class _Run:
-    """An open run and the way to it."""
-
-    def __init__(self, client: MlflowClient, run_id: str, *, owned: bool) -> None:
-        """`owned` runs are closed by us."""
-        self.client = client
-        self.run_id = run_id
-        self.owned = owned
-        self.writer = MLflowWriter(client, run_id)
+_log = logging.getLogger(__name__)
 
 
 class MLflowCallback(BaseCallback):
@@ -50,6 +40,13 @@ class MLflowCallback(BaseCallback):
     One line is enough:
 
         model.learn(300_000, callback=[MetricsCallback(), MLflowCallback()])
+
+    and in rl_zoo3's hyper-parameters `callback: avp_sb3.MLflowCallback`. Nothing waits for MLflow: what is logged is on
+    disk at once (`runs/mlflow-spool`) and with MLflow some seconds later. When the server is gone it is kept, and sent
+    when the server is back or by `python -m avp_habitat.tracking.deliver`.
+
+    `learn(reset_num_timesteps=False)` with a model whose run was interrupted goes on in the same run. The run of a
+    training that was killed is closed as KILLED at the next start.
 
     SB3 tells its callbacks nothing when `learn()` is left by an exception or Ctrl-C. To have the run closed at that
     moment and with the right status (FAILED, or KILLED for an interruption), make it a context:
@@ -63,11 +60,14 @@ class MLflowCallback(BaseCallback):
 
     def __init__(
         self,
-        experiment: str = "avp",
+        experiment: str = DEFAULT_EXPERIMENT,
         run_name: str | None = None,
         tracking_uri: str | None = None,
         *,
+        run_id: str | None = None,
         log_model: bool = True,
+        checkpoint_s: float = 60.0,
+        offline: bool | None = None,
         params: Mapping[str, Any] | None = None,
         tags: Mapping[str, str] | None = None,
         verbose: int = 0,
@@ -79,20 +79,33 @@ class MLflowCallback(BaseCallback):
             run_name: name of the run; MLflow invents one when omitted.
             tracking_uri: where runs are kept; when omitted, what `mlflow.set_tracking_uri` or `MLFLOW_TRACKING_URI`
                 say, else `sqlite:///mlflow.db` in the current folder.
-            log_model: keep the model as artifact `model.zip`, unless the training failed.
+            run_id: go on with this run; when omitted, with the model's own if it was interrupted.
+            log_model: keep the model as artifact `model.zip`, at the end unless the training failed, and on the way.
+            checkpoint_s: seconds between two models that are kept on the way, each in place of the one before.
+            offline: True goes on when the server does not answer at the start, and sends everything later; when
+                omitted, as the variable `AVP_MLFLOW_OFFLINE` says.
             params: further parameters; nested mappings become dotted names.
             tags: further tags.
             verbose: 1 prints where the run is.
+
+        Raises:
+            UsageError: a number that cannot be right.
         """
         super().__init__(verbose)
+        if checkpoint_s <= 0:
+            raise UsageError(f"MLflowCallback checkpoint_s: expected seconds above 0, got {checkpoint_s}")
         self.run_id: str | None = None
-        self._experiment = experiment
-        self._run_name = run_name
+        self._new = NewRun(experiment=experiment, name=run_name)
         self._tracking_uri = tracking_uri
+        self._wanted_run = run_id
         self._log_model = log_model
+        self._checkpoint_s = checkpoint_s
+        self._offline = offline
         self._params = dict(params or {})
         self._tags = dict(tags or {})
-        self._run: _Run | None = None
+        self._run: TrackedRun | None = None
+        self._writer: MLflowWriter | None = None
+        self._saved_at = 0.0
         self._last_episode: tuple[int, Trajectory] | None = None
 
     def __enter__(self) -> "MLflowCallback":
@@ -106,40 +119,51 @@ class MLflowCallback(BaseCallback):
         self.close("KILLED" if kind is None else _status_of(error))
 
     def close(self, status: Status = "KILLED") -> None:
-        """Flush the metrics and close the run with this status, if it is still open."""
+        """Send what is left and close the run with this status, if it is still open."""
         if self._run is None:
             return
         run, self._run = self._run, None
         atexit.unregister(self._close_at_exit)
         try:
-            self._write_pending_values(run)
+            self._write_pending_values()
             if status != "FAILED":
-                self._log_artifacts(run)
+                self._save_model(run)
+                self._save_trajectory(run)
         except Exception as error:
             status = "FAILED"
-            warnings.warn(f"MLflow run {run.run_id}: closing it went wrong: {error!r}", stacklevel=2)
+            _log.warning("MLflow run %s: closing it went wrong: %r", run.run_id, error)
         finally:
-            if run.writer in self.logger.output_formats:
-                self.logger.output_formats.remove(run.writer)
-            if run.owned:
-                run.client.set_terminated(run.run_id, status)
+            if self._writer in self.logger.output_formats:
+                self.logger.output_formats.remove(self._writer)
+            run.close(status)
+            self._remember(run)
 
     def _on_training_start(self) -> None:
         self.close("KILLED")
         self._last_episode = None
+        earlier = self._models_run()
         self._run = run = self._open_run()
-        self.run_id = run.run_id
+        self._remember(run)
         atexit.register(self._close_at_exit)
         try:
-            self._log_facts(run)
+            self._log_facts(run, earlier)
         except BaseException as error:
             self.close(_status_of(error))
             raise
-        self.logger.output_formats.append(run.writer)
-        # Kept inside the model's .zip, so that a rollout can name the run its policy comes from.
-        self.model.avp_mlflow_run_id = run.run_id  # type: ignore[attr-defined]
+        self._writer = MLflowWriter(run)
+        self.logger.output_formats.append(self._writer)
+        self._saved_at = time.monotonic()
+        recovery = recover_in_background(spool_folder(), _tell_recovered)
+        # The usual case, a store on this machine, is a matter of milliseconds; a slow server is not waited for.
+        recovery.join(0.5)
         if self.verbose:
-            print(f"MLflow run {run.run_id} at {run.client.tracking_uri}")
+            print(f"MLflow run {run.run_id} at {shown(run.address)}")
+
+    def _on_rollout_start(self) -> None:
+        # Here the model is as it was after its last update, for which the step count stands.
+        if self._run is not None and time.monotonic() - self._saved_at >= self._checkpoint_s:
+            self._save_model(self._run)
+            self._saved_at = time.monotonic()
 
     def _on_step(self) -> bool:
         for index, info in finished_episodes(self.locals):
@@ -149,56 +173,64 @@ class MLflowCallback(BaseCallback):
 
     def _on_training_end(self) -> None:
         # rl_zoo3 calls this once more in a `finally`, whatever ended `learn()`.
-        self.close("FINISHED" if _is_learning(self.model) else _status_of(sys.exc_info()[1]))
+        self.close("FINISHED" if is_learning(self.model) else _status_of(sys.exc_info()[1]))
 
-    def _open_run(self) -> "_Run":
-        """The active run, or a new one."""
+    def _open_run(self) -> TrackedRun:
+        """The active run, the one to go on with, or a new one."""
+        configured = mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else DEFAULT_ADDRESS
         active = mlflow.active_run()
-        if active is None:
-            configured = mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else DEFAULT_TRACKING_URI
-            client = MlflowClient(self._tracking_uri or configured)
-            return _Run(client, self._create_run(client), owned=True)
-        if self._tracking_uri not in (None, mlflow.get_tracking_uri()):
-            raise UsageError(
-                f"tracking_uri {self._tracking_uri}: the active MLflow run {active.info.run_id} is kept at "
-                f"{mlflow.get_tracking_uri()}; end that run or leave tracking_uri out"
-            )
-        return _Run(MlflowClient(), active.info.run_id, owned=False)
+        if active is not None:
+            if self._tracking_uri not in (None, mlflow.get_tracking_uri()):
+                raise UsageError(
+                    f"tracking_uri {self._tracking_uri}: the active MLflow run {active.info.run_id} is kept at "
+                    f"{mlflow.get_tracking_uri()}; end that run or leave tracking_uri out"
+                )
+            return join_run(mlflow.get_tracking_uri(), active.info.run_id)
+        address = self._tracking_uri or configured
+        if self._wanted_run is not None:
+            return continue_run(address, self._wanted_run, offline=self._offline)
+        earlier = self._models_run() if self.model.num_timesteps > 0 else None
+        if earlier is not None and may_continue(address, earlier):
+            return continue_run(address, earlier, offline=self._offline)
+        return start_run(address, self._new, offline=self._offline)
 
-    def _create_run(self, client: MlflowClient) -> str:
-        experiment = client.get_experiment_by_name(self._experiment)
-        identity = experiment.experiment_id if experiment else client.create_experiment(self._experiment)
-        return client.create_run(identity, tags=resolve_tags(), run_name=self._run_name).info.run_id
+    def _models_run(self) -> str | None:
+        """The run that trained the model so far."""
+        return getattr(self.model, "avp_mlflow_run_id", None)
 
-    def _log_facts(self, run: "_Run") -> None:
+    def _remember(self, run: TrackedRun) -> None:
+        """Keep the run's id, also within the model's .zip, so that a rollout can name the run of its policy."""
+        self.run_id = run.run_id
+        self.model.avp_mlflow_run_id = run.run_id  # type: ignore[attr-defined]
+
+    def _log_facts(self, run: TrackedRun, earlier: str | None) -> None:
         env = self.training_env
         params = hyperparameters(self.model) | task_settings(env) | flat(self._params)
-        tags = version_tags() | scene_tags(env)
-        if (commit := git_commit()) is not None:
-            tags["mlflow.source.git.commit"] = commit
-        if (earlier := getattr(self.model, "avp_mlflow_run_id", None)) not in (None, run.run_id):
+        tags = {"avp.kind": "training"} | scene_tags(env)
+        steps = self.model.num_timesteps
+        if earlier is not None and earlier != run.run_id:
             tags["avp.continued_from"] = earlier
-        run.client.log_batch(
-            run.run_id,
-            params=[Param(safe_name(key), str(value)[:_MAX_PARAM]) for key, value in params.items()],
-            tags=[RunTag(safe_name(key), value) for key, value in (tags | self._tags).items()],
-        )
+        elif steps > 0:
+            tags["avp.resumed_at_step"] = str(steps)
+        run.params(params)
+        run.tags(tags | self._tags)
+        # MLflow keeps parameters as texts; here they are numbers, lists and truth values.
+        text = json.dumps(params, indent=1, default=str) + "\n"
+        run.save(PARAMS_FILE, lambda file: file.write_text(text, encoding="utf-8"))
 
-    def _write_pending_values(self, run: "_Run") -> None:
+    def _write_pending_values(self) -> None:
         """Values recorded after the logger's last dump: the last update's losses, or what an interruption cut off."""
-        run.writer.write(self.logger.name_to_value, self.logger.name_to_excluded, self.model.num_timesteps)
-        run.writer.flush()
+        if self._writer is not None:
+            self._writer.write(self.logger.name_to_value, self.logger.name_to_excluded, self.model.num_timesteps)
 
-    def _log_artifacts(self, run: "_Run") -> None:
-        with tempfile.TemporaryDirectory() as name:
-            if self._log_model:
-                path = Path(name) / MODEL_FILE
-                self.model.save(path)
-                run.client.log_artifact(run.run_id, os.fspath(path))
-            if self._last_episode is not None and self.training_env.has_attr("area"):
-                path = Path(name) / TRAJECTORY_FILE
-                self._draw(path, *self._last_episode)
-                run.client.log_artifact(run.run_id, os.fspath(path))
+    def _save_model(self, run: TrackedRun) -> None:
+        if self._log_model:
+            run.save(MODEL_FILE, self.model.save)
+
+    def _save_trajectory(self, run: TrackedRun) -> None:
+        if self._last_episode is not None and self.training_env.has_attr("area"):
+            index, trajectory = self._last_episode
+            run.save(TRAJECTORY_FILE, lambda file: self._draw(file, index, trajectory))
 
     def _draw(self, path: Path, index: int, trajectory: "Trajectory") -> None:
         from avp_habitat.drawing import draw_trajectory
@@ -216,11 +248,7 @@ def _status_of(error: BaseException | None) -> Status:
     return "KILLED" if interrupted else "FAILED"
 
 
-def _is_learning(model: Any) -> bool:
-    """Whether `model.learn` is among the callers, that is, whether the training came to its own end."""
-    frame = sys._getframe()
-    while frame is not None:
-        if frame.f_code.co_name == "learn" and frame.f_locals.get("self") is model:
-            return True
-        frame = frame.f_back
-    return False
+def _tell_recovered(result: Recovered) -> None:
+    what = "closed as KILLED" if result.killed else "completed"
+    state = what if result.delivered else "still not sent"
+    _log.warning("MLflow run %s of an earlier program, at %s: %s", result.run_id, shown(result.address), state)

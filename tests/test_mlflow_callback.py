@@ -1,3 +1,4 @@
+import json
 import os
 import signal
 import subprocess
@@ -11,9 +12,14 @@ from mlflow import MlflowClient
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from tracking import BreakingEnv, SmallEnv, mlflow_home, ppo
+from tracking_server import free_port
 
 from avp_habitat.errors import UsageError
 from avp_habitat.provenance import flat
+from avp_habitat.simulators import make_simulator
+from avp_habitat.tracking import deliver
+from avp_habitat.tracking.addresses import TrackingError
+from avp_habitat.tracking.remote import find_run
 from avp_sb3 import MetricsCallback, MLflowCallback
 from avp_sb3.run_facts import hyperparameters
 
@@ -65,7 +71,7 @@ def test_the_last_trajectory_is_a_picture_of_the_run(client, tmp_path):
 
     callback = MLflowCallback(log_model=False)
     ppo().learn(64, callback=callback)
-    assert [file.path for file in client.list_artifacts(callback.run_id)] == ["trajectory.png"]
+    assert {file.path for file in client.list_artifacts(callback.run_id)} == {"trajectory.png", "params.json"}
     picture = read_rgb(Path(client.download_artifacts(callback.run_id, "trajectory.png", str(tmp_path))))
     assert picture.std() > 5
 
@@ -90,7 +96,8 @@ def test_a_context_closes_a_broken_run_with_its_metrics(client, error, status):
     run = client.get_run(callback.run_id)
     assert run.info.status == status
     assert [point.step for point in client.get_metric_history(callback.run_id, "avp/coverage")] == [64, 99]
-    assert bool(client.list_artifacts(callback.run_id)) == (status == "KILLED")
+    kept = {file.path for file in client.list_artifacts(callback.run_id)}
+    assert ("model.zip" in kept) == (status == "KILLED")
 
 
 def test_a_context_leaves_a_finished_run_alone(client):
@@ -135,17 +142,123 @@ def test_a_host_that_cleans_up_after_an_error_fails_the_run(client):
     assert client.get_run(callback.run_id).info.status == "FAILED"
 
 
-def test_the_next_training_closes_an_interrupted_run_and_names_it(client):
-    model, callback = ppo(BreakingEnv(KeyboardInterrupt())), MLflowCallback()
+def interrupted(callback):
+    model = ppo(BreakingEnv(KeyboardInterrupt()))
     with pytest.raises(KeyboardInterrupt):
         model.learn(256, callback=callback)
-    first = callback.run_id
+    return model, callback.run_id
+
+
+def test_a_training_that_goes_on_after_an_interruption_goes_on_in_its_run(client):
+    callback = MLflowCallback()
+    model, first = interrupted(callback)
     assert client.get_run(first).info.status == "RUNNING"
-    model.learn(64, callback=callback, reset_num_timesteps=False)
+    model.learn(64, callback=[MetricsCallback(), callback], reset_num_timesteps=False)
+    run = client.get_run(callback.run_id)
+    assert callback.run_id == first
+    assert run.info.status == "FINISHED"
+    assert run.data.tags["avp.resumed_at_step"] == "99"
+    assert json.loads(run.data.tags["avp.changed_params"]) == {"total_timesteps": ["256", "163"]}
+    assert [point.step for point in client.get_metric_history(first, "avp/coverage")] == [163]
+
+
+def test_a_training_that_begins_anew_closes_the_interrupted_run(client):
+    callback = MLflowCallback()
+    model, first = interrupted(callback)
+    model.learn(64, callback=callback)
     assert client.get_run(first).info.status == "KILLED"
-    second = client.get_run(callback.run_id)
-    assert second.info.status == "FINISHED"
-    assert second.data.tags["avp.continued_from"] == first
+    assert callback.run_id != first
+    assert client.get_run(callback.run_id).data.tags["avp.continued_from"] == first
+
+
+def test_a_training_that_goes_on_after_a_finished_one_has_a_run_of_its_own(client):
+    model, callback = ppo(), MLflowCallback(log_model=False)
+    model.learn(64, callback=callback)
+    first = callback.run_id
+    model.learn(64, callback=callback, reset_num_timesteps=False)
+    assert client.get_run(callback.run_id).data.tags["avp.continued_from"] == first
+    assert client.get_run(first).info.status == client.get_run(callback.run_id).info.status == "FINISHED"
+
+
+def test_a_run_can_be_named_to_go_on_with(client):
+    first = MLflowCallback(log_model=False)
+    ppo().learn(64, callback=first)
+    second = MLflowCallback(run_id=first.run_id, log_model=False)
+    ppo().learn(64, callback=second)
+    assert second.run_id == first.run_id
+    assert client.get_run(first.run_id).info.status == "FINISHED"
+    with pytest.raises(TrackingError, match=r"MLflow run nothing: expected a run at sqlite:.*, found none"):
+        ppo().learn(64, callback=MLflowCallback(run_id="nothing"))
+
+
+def test_the_model_is_kept_on_the_way(client, tmp_path):
+    class Look(BaseCallback):
+        steps = 0
+
+        def _on_rollout_end(self):
+            if self.num_timesteps == 192:
+                callback._run.flush()
+                path = client.download_artifacts(callback.run_id, "model.zip", str(tmp_path))
+                self.steps = PPO.load(path, device="cpu").num_timesteps
+
+        def _on_step(self):
+            return True
+
+    callback, look = MLflowCallback(checkpoint_s=1e-9), Look()
+    ppo().learn(192, callback=[callback, look])
+    assert look.steps == 128
+    with pytest.raises(UsageError, match="checkpoint_s: expected seconds above 0, got 0"):
+        MLflowCallback(checkpoint_s=0)
+
+
+def test_parameters_are_kept_with_their_types(client, tmp_path):
+    callback = MLflowCallback(log_model=False)
+    ppo(learning_rate=3e-4, policy_kwargs={"net_arch": [16]}).learn(64, callback=callback)
+    kept = json.loads(Path(client.download_artifacts(callback.run_id, "params.json", str(tmp_path))).read_text())
+    assert kept["learning_rate"] == 3e-4
+    assert kept["policy_kwargs.net_arch"] == [16]
+    assert kept["normalize_advantage"] is True
+
+
+def test_a_training_goes_on_without_its_server_when_told_to(client, tmp_path):
+    address = f"http://127.0.0.1:{free_port()}"
+    with pytest.raises(TrackingError, match=r"no server answers there .*offline=True, or AVP_MLFLOW_OFFLINE=1"):
+        ppo().learn(64, callback=MLflowCallback(tracking_uri=address))
+    model, callback = ppo(), MLflowCallback(tracking_uri=address, offline=True)
+    model.learn(64, callback=[MetricsCallback(), callback])
+    assert callback.run_id.startswith("offline-")
+    # The server that was meant never comes; the points can go elsewhere.
+    deliver.main(["--mlflow", client.tracking_uri])
+    run = find_run(client, callback.run_id)
+    assert run.info.status == "FINISHED"
+    assert [point.step for point in client.get_metric_history(run.info.run_id, "avp/coverage")] == [64]
+    path = client.download_artifacts(run.info.run_id, "model.zip", str(tmp_path))
+    assert PPO.load(path, device="cpu").avp_mlflow_run_id == callback.run_id
+    assert not any((tmp_path / "runs").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("address", "problem"),
+    [
+        ("gopher://here", "unknown scheme 'gopher'; MLflow knows .*'sqlite'"),
+        ("sqlite:////proc/nowhere/mlflow.db", "No such file or directory: '/proc/nowhere'"),
+    ],
+)
+def test_addresses_that_cannot_be_used_are_named_at_the_start(client, address, problem):
+    with pytest.raises(TrackingError, match=f"MLflow at {address} cannot be used: {problem}"):
+        ppo().learn(64, callback=MLflowCallback(tracking_uri=address))
+
+
+def test_a_folder_of_runs_needs_mlflows_own_switch(client, tmp_path, monkeypatch):
+    folder = (tmp_path / "kept").as_uri()
+    with pytest.raises(TrackingError, match="MLFLOW_ALLOW_FILE_STORE=true"):
+        ppo().learn(64, callback=MLflowCallback(tracking_uri=folder))
+    monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
+    callback = MLflowCallback(tracking_uri=folder)
+    ppo().learn(128, callback=[MetricsCallback(), callback])
+    run = MlflowClient(folder).get_run(callback.run_id)
+    assert run.info.status == "FINISHED"
+    assert [p.step for p in MlflowClient(folder).get_metric_history(callback.run_id, "avp/coverage")] == [64, 128]
 
 
 @pytest.mark.parametrize(
@@ -194,12 +307,24 @@ def test_an_active_run_elsewhere_is_refused(client, tmp_path):
         ppo().learn(64, callback=MLflowCallback(tracking_uri=f"sqlite:///{tmp_path}/other.db"))
 
 
-def test_an_unusable_parameter_closes_the_run_and_says_so(client):
+def test_a_parameter_that_a_run_has_already_stays_and_the_change_is_noted(client):
     with mlflow.start_run() as outer:
         mlflow.log_param("algo", "other")
-        with pytest.raises(mlflow.MlflowException, match="algo"):
-            ppo().learn(64, callback=MLflowCallback())
-    assert client.get_run(outer.info.run_id).data.params["algo"] == "other"
+        ppo().learn(64, callback=MLflowCallback())
+    data = client.get_run(outer.info.run_id).data
+    assert (data.params["algo"], data.params["n_steps"]) == ("other", "64")
+    assert json.loads(data.tags["avp.changed_params"]) == {"algo": ["other", "PPO"]}
+
+
+def test_runs_of_others_in_this_program_know_versions_and_open_scenes(client):
+    env = make_simulator("raycast", "builtin:0")
+    with mlflow.start_run() as run:
+        pass
+    tags = client.get_run(run.info.run_id).data.tags
+    assert tags["avp.scene"] == "builtin:0"
+    assert tags["avp.scene_digest"] == env.scene_digest
+    assert tags["version.stable-baselines3"]
+    assert tags["system.platform"]
 
 
 def test_without_any_setting_the_database_lies_in_the_current_folder(client, monkeypatch, tmp_path):

@@ -30,6 +30,10 @@ class TrackingError(AVPError):
     """An MLflow store that cannot be used, or does not take what it is given."""
 
 
+class StoreUnreachableError(TrackingError):
+    """An MLflow store that may be there another time."""
+
+
 def address_of(option: str, *, default: str | None) -> str | None:
     """The MLflow address that an option means.
 
@@ -54,11 +58,12 @@ def connect(address: str) -> "MlflowClient":
     """A client of a store that answers.
 
     Raises:
-        TrackingError: MLflow is not installed, or the store cannot be reached.
+        StoreUnreachableError: the store cannot be reached now.
+        TrackingError: MLflow is not installed, or does not know such addresses.
     """
     problem = unreachable(address)
     if problem is not None:
-        raise _unusable(address, problem)
+        raise StoreUnreachableError(_unusable(address, problem))
     # A new database otherwise announces that it is made and each of its fifty migrations.
     for name in ("alembic", "mlflow.store.db.utils"):
         logging.getLogger(name).setLevel(logging.WARNING)
@@ -71,7 +76,10 @@ def connect(address: str) -> "MlflowClient":
     except ImportError as error:
         raise TrackingError(f"MLflow is asked for but not installed ({error}): pip install mlflow") from None
     except Exception as error:
-        raise _unusable(address, _reason(address, error)) from None
+        reason = _misunderstood(address, error)
+        if reason is not None:
+            raise TrackingError(_unusable(address, reason)) from None
+        raise StoreUnreachableError(_unusable(address, first_line(error))) from None
     return client
 
 
@@ -105,18 +113,20 @@ def unreachable(address: str) -> str | None:
 
 def first_line(error: BaseException) -> str:
     """An error's text without its tail of hints and stack frames."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.strerror}: {error.filename!r}"
     return str(error).strip().partition("\n")[0] or repr(error)
 
 
-def _reason(address: str, error: Exception) -> str:
-    """What MLflow's error means, where its own text would not help."""
+def _misunderstood(address: str, error: Exception) -> str | None:
+    """What is wrong with an address that can never work; None for another error."""
     line = first_line(error)
     if "MLFLOW_ALLOW_FILE_STORE" in line:
         return "MLflow 3 keeps runs in a folder only when the variable MLFLOW_ALLOW_FILE_STORE=true is set"
     if "unsupported URI" in line:
         known = line.partition("[")[2].partition("]")[0]
         return f"unknown scheme {urlsplit(address).scheme!r}; MLflow knows {known}"
-    return line
+    return None
 
 
 @contextmanager
@@ -156,8 +166,8 @@ def experiment_id(client: "MlflowClient", name: str) -> tuple[str, bool]:
     raise AssertionError
 
 
-def _unusable(address: str, problem: str) -> TrackingError:
-    return TrackingError(
+def _unusable(address: str, problem: str) -> str:
+    return (
         f"MLflow at {shown(address)} cannot be used: {problem}; expected an address such as {DEFAULT_ADDRESS} or "
         "http://127.0.0.1:5000, or off"
     )

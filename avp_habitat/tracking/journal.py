@@ -116,6 +116,14 @@ class Journal:
         journal.header = header
         return journal
 
+    @classmethod
+    def in_use(cls, folder: Path) -> bool:
+        """Whether a living process holds a journal."""
+        journal = cls.adopt(folder)
+        if journal is not None:
+            journal.release()
+        return journal is None
+
     def last_written_ms(self) -> int:
         """When the last entry was written, milliseconds since 1970."""
         return int(os.fstat(self._file).st_mtime * 1000)

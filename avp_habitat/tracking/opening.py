@@ -8,9 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
-from avp_habitat.tracking.addresses import DEFAULT_EXPERIMENT, TrackingError, absolute, connect, first_line, shown
+from avp_habitat.tracking.addresses import (
+    DEFAULT_EXPERIMENT,
+    StoreUnreachableError,
+    TrackingError,
+    absolute,
+    connect,
+    first_line,
+    shown,
+)
 from avp_habitat.tracking.journal import VERSION, Journal, spool_folder
-from avp_habitat.tracking.remote import OFFLINE, create, existing_run, reopen
+from avp_habitat.tracking.remote import OFFLINE, create, existing_run, find_run, reopen
 from avp_habitat.tracking.run import TrackedRun
 
 if TYPE_CHECKING:
@@ -112,6 +120,23 @@ def continue_run(
     return _reopened(journal, client, **options)
 
 
+def may_continue(address: str, run_id: str, *, spool: Path | None = None) -> bool:
+    """Whether a run was interrupted, so that going on with its model goes on with the run.
+
+    A run that MLflow takes for running, and of which this machine has no journal, may be running elsewhere.
+    """
+    home = spool or spool_folder()
+    for folder in home.glob("*"):
+        header = Journal.peek(folder)
+        if header is not None and run_id in (header["run_id"], f"{OFFLINE}{header['key']}"):
+            return header["ended"] != "FINISHED" and not Journal.in_use(folder)
+    try:
+        run = find_run(connect(address), run_id)
+    except TrackingError:
+        return False
+    return run is not None and run.info.status in ("KILLED", "FAILED")
+
+
 def join_run(address: str, run_id: str, *, spool: Path | None = None, **options: Any) -> TrackedRun:
     """Fill a run that somebody else has opened and will end.
 
@@ -133,10 +158,10 @@ def join_run(address: str, run_id: str, *, spool: Path | None = None, **options:
 def _client(address: str, *, offline: bool) -> "MlflowClient | None":
     try:
         return connect(address)
-    except TrackingError as error:
+    except StoreUnreachableError as error:
         if offline:
             return None
-        raise TrackingError(
+        raise StoreUnreachableError(
             f"{error}; to go on without it and send everything later: offline=True, or {OFFLINE_VARIABLE}=1 set"
         ) from None
 

@@ -92,19 +92,26 @@ class Sender:
     def _work(self) -> None:
         pause = _RETRY_S[0]
         while not self._stopped.is_set():
-            if not self._journal.wait(1.0, for_entries=True):
+            if not self._journal.wait(0.2, for_entries=True):
                 continue
             try:
                 self._send_some()
             except Exception as error:
                 self._uncertain = True
                 self._failed(first_line(error))
-                self._stopped.wait(min(pause, 2.0) if self._hurry.is_set() else pause)
+                self._rest(pause)
                 pause = min(2 * pause, _RETRY_S[1])
                 continue
             self._worked()
             pause = _RETRY_S[0]
             self._hurry.wait(self._interval_s)
+
+    def _rest(self, pause: float) -> None:
+        """Wait before trying again; somebody who starts to wait for us ends it, and then makes it short."""
+        if self._hurry.is_set():
+            self._stopped.wait(min(pause, 0.5))
+        else:
+            self._hurry.wait(pause)
 
     def _send_some(self) -> None:
         if (problem := unreachable(self._address)) is not None:
