@@ -5,15 +5,25 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from avp_sb3.evaluation import PolicyResult, evaluate_policy
+    from avp_sb3.evaluation_callback import EvaluationCallback
     from avp_sb3.metrics_callback import MetricsCallback
     from avp_sb3.mlflow_callback import MLflowCallback
     from avp_sb3.rerun_callback import RerunCallback
     from avp_sb3.vec_env import AVPVecEnv
 
-__all__ = ["AVPVecEnv", "MLflowCallback", "MetricsCallback", "PolicyResult", "RerunCallback", "evaluate_policy"]
+__all__ = [
+    "AVPVecEnv",
+    "EvaluationCallback",
+    "MLflowCallback",
+    "MetricsCallback",
+    "PolicyResult",
+    "RerunCallback",
+    "evaluate_policy",
+]
 
 _HOME = {
     "AVPVecEnv": "avp_sb3.vec_env",
+    "EvaluationCallback": "avp_sb3.evaluation_callback",
     "MetricsCallback": "avp_sb3.metrics_callback",
     "MLflowCallback": "avp_sb3.mlflow_callback",
     "RerunCallback": "avp_sb3.rerun_callback",

@@ -1,0 +1,215 @@
+"""The policy of a running training on other scenes: figures, pictures, and the best model kept."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Image
+from stable_baselines3.common.vec_env import VecEnv
+
+from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.settings import TaskSettings
+from avp_sb3.best_model import WHEN, BestModel, statistics_of
+from avp_sb3.evaluation_batch import FIGURES, READER, BatchEpisode, FixedStarts, means, run_batch, scenes_of
+from avp_sb3.evaluation_fit import check_fit, normalised_like
+from avp_sb3.evaluation_picture import evaluation_picture
+from avp_sb3.finished_episodes import MissingInfoError
+from avp_sb3.learning import is_learning
+from avp_sb3.logged_file import NOT_FOR, LoggedFile
+from avp_sb3.own_dump import logged_alone, move_to_front
+from avp_sb3.random_state import own_random_state
+
+DEFAULT_SCENES = ("builtin:7",)
+_SCREEN = ("stdout", "log")
+_NO_PICTURES = (*_SCREEN, "json", "csv")
+_LONGEST_SCENE = 18
+"""Letters of a scene's name on the screen: SB3 cuts names at 36 and refuses two that it cut to the same."""
+
+
+class EvaluationCallback(BaseCallback):
+    """Evaluates the policy on other scenes while it trains, from the same starts each time, and keeps the best model.
+
+    One line is enough:
+
+        model.learn(300_000, callback=[MLflowCallback(), EvaluationCallback(("builtin:7", "builtin:8"))])
+
+    or in rl_zoo3's hyper-parameters:
+
+        callback: [{avp_sb3.EvaluationCallback: {scenes: ["builtin:7"], every: 50000}}]
+
+    It logs `eval/coverage`, `eval/views`, `eval/cpv`, `eval/annd_m`, `eval/ei`, `eval/coverage_area`, `eval/return` and
+    the other figures of `avp_sb3.evaluate` (means over all scenes and episodes), per scene `eval/SCENE/coverage` … when
+    there are several, a picture `eval/SCENE/trajectory` (the first start's path, and coverage by view), and
+    `eval/best_SCORE` with the model itself when it is better than before. The last evaluation is that of the finished
+    model; an interrupted training has none. The training's environment and random numbers are not touched: with or
+    without this callback the same weights come out.
+    """
+
+    def __init__(
+        self,
+        scenes: str | Sequence[str] | None = None,
+        *,
+        eval_env: VecEnv | None = None,
+        every: int = 100_000,
+        episodes: int = 10,
+        seed: int = 1000,
+        deterministic: bool = False,
+        score: str = "return",
+        best_model: str | Path | None = f"runs/best-{WHEN}.zip",
+        settings: TaskSettings | None = None,
+        simulator: str = "raycast",
+        verbose: int = 0,
+    ) -> None:
+        """Describe the evaluation; scenes are opened when the training starts.
+
+        Args:
+            scenes: mesh files or `builtin:SEED`; `builtin:7` when omitted.
+            eval_env: instead of scenes: an environment of its own whose `info` holds `avp_episode` at the end of an
+                episode. With `coverage` in every `info` there is a curve, with attributes `scene_name`, `area` and
+                `settings` (those of `AVP-v0`) there are figures per scene, maps, and figures of the whole budget.
+            every: environment steps of all agents together between two evaluations.
+            episodes: in each scene.
+            seed: episode i of a scene starts from `seed + i`, as in `avp_sb3.evaluate`. An `eval_env` with fewer
+                environments than episodes has this only for the first ones; the others follow from them.
+            deterministic: take the likeliest actions. False samples them, which is the fairer test of a policy that
+                trains with sampled ones (docs/training.md), with the same random numbers each time.
+            score: the figure by which the best model is chosen: `return` or another one of those logged. The least is
+                best for views, path_length_m, collisions and redundant_share, the greatest for all others.
+            best_model: file of the best model; `DATE-TIME` in its name becomes when the training started; None keeps
+                none. A file that exists is refused unless the training that made it goes on.
+            settings: of the task; those of the training's environment when omitted, also whether views are looked up.
+            simulator: that opens the scenes.
+            verbose: 1 prints when a better model is kept.
+
+        Raises:
+            UsageError: a number, name or combination that cannot be right.
+        """
+        super().__init__(verbose)
+        for name, value in (("every", every), ("episodes", episodes)):
+            if value < 1:
+                raise UsageError(f"{READER} {name}: expected at least 1, got {value}")
+        if score not in FIGURES:
+            raise unknown_name("score", score, FIGURES)
+        self._scenes = _scenes(scenes, eval_env, settings)
+        self._given, self._env = eval_env, eval_env
+        self._agents: dict[str, list[int]] = {}
+        self._every, self._episodes, self._seed = every, episodes, seed
+        self._deterministic, self._score = deterministic, score
+        self._settings, self._simulator = settings, simulator
+        self._best = BestModel(best_model, score)
+        self._due = 0
+        self._evaluated_at: int | None = None
+
+    @property
+    def best_model(self) -> Path | None:
+        """File of the best model, known once the training has started."""
+        return self._best.path
+
+    @property
+    def best(self) -> float | None:
+        """The best score so far."""
+        return self._best.value
+
+    def _on_training_start(self) -> None:
+        with own_random_state(self.model, self._seed):
+            self._env = self._open() if self._given is None else self._given
+        check_fit(self.model, self.training_env, self._env, reader=READER)
+        self._agents = scenes_of(self._env)
+        self._best.start(self.model)
+        self._evaluated_at = None
+        self._plan_next()
+        move_to_front(self, self.locals.get("callback"))
+
+    def _on_step(self) -> bool:
+        # The last evaluation comes after the last update; one within the last rollout would be the same but worse.
+        if self._due <= self.num_timesteps < self.model._total_timesteps:
+            self._evaluate()
+            self._plan_next()
+        return True
+
+    def _on_training_end(self) -> None:
+        self.num_timesteps = self.model.num_timesteps
+        if is_learning(self.model) and self._evaluated_at != self.num_timesteps:
+            self._evaluate()
+
+    def _plan_next(self) -> None:
+        self._due = (self.num_timesteps // self._every + 1) * self._every
+
+    def _open(self) -> VecEnv:
+        settings = self._settings
+        if settings is None:
+            env = self.training_env
+            settings = env.get_attr("settings", 0)[0] if env.has_attr("settings") else None
+            if not isinstance(settings, TaskSettings):
+                raise UsageError(
+                    f"{READER}: the training's environment has no settings of AVP-v0 to evaluate with; expected "
+                    "settings, or an eval_env of its own kind"
+                )
+        return FixedStarts(self._scenes, episodes=self._episodes, simulator=self._simulator, settings=settings)
+
+    def _evaluate(self) -> None:
+        assert self._env is not None
+        quota = {agent: count for agents in self._agents.values() for agent, count in _spread(agents, self._episodes)}
+        with own_random_state(self.model, self._seed), normalised_like(self.model, self._env):
+            episodes = run_batch(self.model, self._env, quota, seed=self._seed, deterministic=self._deterministic)
+        self._evaluated_at = self.num_timesteps
+        with logged_alone(self):
+            self._record(episodes)
+
+    def _record(self, episodes: Sequence[BatchEpisode]) -> None:
+        figures = means(episodes)
+        for name, value in figures.items():
+            self.logger.record(f"eval/{name}", value)
+        for scene, agents in self._agents.items():
+            own = [episode for episode in episodes if episode.agent in agents]
+            if len(self._agents) > 1:
+                exclude = _SCREEN if len(scene) > _LONGEST_SCENE else None
+                for name, value in means(own).items():
+                    self.logger.record(f"eval/{scene}/{name}", value, exclude)
+            self.logger.record(f"eval/{scene}/trajectory", Image(self._picture(own), "HWC"), exclude=_NO_PICTURES)
+        if self._score not in figures:
+            raise MissingInfoError(
+                f"{READER} score {self._score!r}: needs 'coverage' in every info and the attribute 'settings' of "
+                f"AVP-v0; this environment gives {', '.join(sorted(figures))}"
+            )
+        if self._best.offer(self.model, figures[self._score]):
+            self._record_best(figures[self._score])
+
+    def _picture(self, episodes: Sequence[BatchEpisode]) -> Any:
+        assert self._env is not None
+        first = episodes[0]
+        area = self._env.get_attr("area", first.agent)[0] if self._env.has_attr("area") else None
+        return evaluation_picture([episode.curve for episode in episodes], area, first.trajectory)
+
+    def _record_best(self, value: float) -> None:
+        self.logger.record(f"eval/best_{self._score}", value)
+        path = self._best.path
+        if path is None:
+            return
+        self.logger.record("eval/best_model", LoggedFile(path, "best_model.zip"), exclude=NOT_FOR)
+        statistics = statistics_of(path)
+        if self.model.get_vec_normalize_env() is not None:
+            file = LoggedFile(statistics, "best_model_vecnormalize.pkl")
+            self.logger.record("eval/best_model_vecnormalize", file, exclude=NOT_FOR)
+        if self.verbose:
+            print(f"{path}: the best model so far, {self._score} {value:.4g} after {self.num_timesteps} steps")
+
+
+def _scenes(scenes: str | Sequence[str] | None, env: VecEnv | None, settings: TaskSettings | None) -> tuple[str, ...]:
+    if env is None:
+        found = DEFAULT_SCENES if scenes is None else (scenes,) if isinstance(scenes, str) else tuple(scenes)
+        if not found:
+            raise UsageError(f"{READER} scenes: expected at least one, got none")
+        if repeated := {scene for scene in found if found.count(scene) > 1}:
+            raise UsageError(f"{READER} scenes: expected each once, got {', '.join(sorted(repeated))} again")
+        return found
+    for name, value in (("scenes", scenes), ("settings", settings)):
+        if value is not None:
+            raise UsageError(f"{READER}: expected {name} or eval_env, got both")
+    return ()
+
+
+def _spread(agents: Sequence[int], episodes: int) -> list[tuple[int, int]]:
+    """How many episodes each of some environments runs: as equal as can be, more at first."""
+    return [(agent, (episodes + len(agents) - 1 - place) // len(agents)) for place, agent in enumerate(agents)]
