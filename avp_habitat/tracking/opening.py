@@ -150,7 +150,7 @@ def join_run(address: str, run_id: str, *, spool: Path | None = None, **options:
         TrackingError: the store cannot be reached or has no such run.
     """
     client = connect(address)
-    existing_run(client, run_id)
+    run_id = existing_run(client, run_id).info.run_id
     header = _header(address) | {"run_id": run_id, "owned": False}
     return TrackedRun(Journal.create(spool or spool_folder(), header), client, **options)
 
