@@ -64,6 +64,7 @@ def _expected_space(model: BaseAlgorithm, env: VecEnv, reader: str) -> gymnasium
             f"{reader}: the training's environment changes observations after VecNormalize; expected an eval_env that "
             "is wrapped in the same way"
         )
+    assert normalised.venv is not None
     return normalised.venv.observation_space
 
 

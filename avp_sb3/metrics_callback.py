@@ -3,10 +3,11 @@
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 
 from avp_habitat.metrics import coverage_per_view
-from avp_sb3.finished_episodes import finished_episodes, required
+from avp_sb3.finished_episodes import MissingInfoError, finished_episodes, required
 
 MEANS = {
     "coverage": "avp/coverage",
@@ -19,6 +20,7 @@ MEANS = {
 }
 """Keys of `info["avp_episode"]`, and the names under which their means are recorded."""
 _RETURN = "return_"
+_READER, _INSIDE = "MetricsCallback", "info['avp_episode']"
 
 
 class EpisodeWindow:
@@ -40,28 +42,47 @@ class EpisodeWindow:
             episode: `info["avp_episode"]`.
 
         Raises:
-            MissingInfoError: a key of `MEANS`, or the return of a reward part that earlier episodes had, is missing.
+            MissingInfoError: a key of `MEANS`, or the return of a reward part that earlier episodes had, is missing or
+                no number.
         """
         if not self._added:
             self._keys = [*MEANS, *sorted(key for key in episode if key.startswith(_RETURN))]
             self._rows = np.empty((self._size, len(self._keys)))
-        self._rows[self._added % self._size] = [
-            required(episode, key, reader="MetricsCallback", inside="info['avp_episode']") for key in self._keys
-        ]
+        self._rows[self._added % self._size] = [_number(episode, key) for key in self._keys]
         self._added += 1
 
     def means(self) -> dict[str, float]:
-        """Means over the window by the name to record, with CpV; empty before the first episode."""
+        """Means over the window by the name to record, with CpV; empty before the first episode.
+
+        An episode in which a figure is nan, not known, does not count for it; a figure that no episode of the window
+        knows is left out.
+        """
         if not self._added:
             return {}
         rows = self._rows[: self._added]
-        mean = dict(zip(self._keys, rows.mean(axis=0).tolist(), strict=True))
-        lengths = rows[:, self._keys.index("views")]
-        return (
-            {name: mean[key] for key, name in MEANS.items()}
-            | {f"reward/{key.removeprefix(_RETURN)}": mean[key] for key in self._keys if key.startswith(_RETURN)}
-            | {"avp/cpv": coverage_per_view(rows[:, self._keys.index("coverage")], lengths)}
-        )
+        mean = rows.mean(axis=0)
+        if np.isnan(mean).any():
+            mean = _known_mean(rows)
+        by_key = dict(zip(self._keys, mean.tolist(), strict=True))
+        named = {MEANS.get(key) or f"reward/{key.removeprefix(_RETURN)}": value for key, value in by_key.items()}
+        named["avp/cpv"] = coverage_per_view(np.array([by_key["coverage"]]), np.array([by_key["views"]]))
+        return {name: value for name, value in named.items() if value == value}
+
+
+def _known_mean(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean of each column over what is not nan; nan for a column of nothing else."""
+    known = ~np.isnan(rows)
+    counts = known.sum(axis=0)
+    sums = np.where(known, rows, 0.0).sum(axis=0)
+    return np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0)
+
+
+def _number(episode: Mapping[str, float], key: str) -> float:
+    value = required(episode, key, reader=_READER, inside=_INSIDE)
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise MissingInfoError(f"{_READER}: expected a number as {_INSIDE}[{key!r}], got {value!r}") from None
 
 
 class MetricsCallback(BaseCallback):
@@ -89,7 +110,7 @@ class MetricsCallback(BaseCallback):
     def _on_step(self) -> bool:
         finished = finished_episodes(self.locals)
         for _, info in finished:
-            self._window.add(required(info, "avp_episode", reader="MetricsCallback"))
+            self._window.add(required(info, "avp_episode", reader=_READER))
         if finished:
             self._record()
         return True

@@ -4,11 +4,14 @@ import sys
 import gymnasium
 import numpy as np
 import pytest
+from corridor import Corridor
+from stable_baselines3 import DQN, SAC
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv
-from tracking import SmallEnv, ppo
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
+from tracking import SETTINGS, SmallEnv, ppo
 
-from avp_sb3 import MetricsCallback
+from avp_sb3 import AVPVecEnv, MetricsCallback
 from avp_sb3.finished_episodes import MissingInfoError
 from avp_sb3.metrics_callback import EpisodeWindow
 
@@ -96,6 +99,19 @@ def test_cpv_is_the_ratio_of_means_not_the_mean_of_ratios():
     assert window.means()["avp/cpv"] == pytest.approx(1.1)
 
 
+def test_an_episode_that_does_not_know_a_figure_does_not_count_for_it():
+    window = EpisodeWindow(4)
+    for coverage, spread in ((0.2, np.nan), (0.4, 3.0), (0.6, 5.0)):
+        window.add(EPISODE | {"coverage": coverage, "annd_m": spread, "return_coverage": np.nan})
+    found = window.means()
+    assert found["avp/annd_m"] == 4.0
+    assert found["avp/coverage"] == pytest.approx(0.4)
+    assert found["avp/cpv"] == pytest.approx(100 * 0.4 / 10)
+    assert "reward/coverage" not in found
+    window.add(EPISODE | {"coverage": np.nan})
+    assert window.means()["avp/coverage"] == pytest.approx(0.4)
+
+
 def test_continued_training_keeps_the_window_and_a_new_one_clears_it():
     model, callback = ppo(SmallEnv()), MetricsCallback()
     model.learn(64, callback=callback)
@@ -116,6 +132,67 @@ def test_a_missing_figure_is_named(key):
     episode = {name: value for name, value in EPISODE.items() if name != key}
     with pytest.raises(MissingInfoError, match=rf"expected '{key}' in info\['avp_episode'\]"):
         EpisodeWindow(3).add(episode)
+
+
+@pytest.mark.parametrize("value", [None, "much", [1.0, 2.0]])
+def test_a_figure_that_is_no_number_is_named(value):
+    with pytest.raises(
+        MissingInfoError, match=r"MetricsCallback: expected a number as info\['avp_episode'\]\['ei'\], got"
+    ):
+        EpisodeWindow(3).add(EPISODE | {"ei": value})
+
+
+class Other(gymnasium.Wrapper):
+    """An environment of somebody else that reports the figures and nothing else of ours."""
+
+    def step(self, action):
+        *rest, info = self.env.step(action)
+        return *rest, {key: value for key, value in info.items() if key == "avp_episode"}
+
+
+def others(count=2):
+    return [lambda: Other(SmallEnv())] * count
+
+
+@pytest.mark.parametrize(
+    "wrapped",
+    [
+        lambda: DummyVecEnv(others()),
+        lambda: VecMonitor(DummyVecEnv(others())),
+        lambda: VecNormalize(VecMonitor(DummyVecEnv(others()))),
+        lambda: VecFrameStack(DummyVecEnv(others()), 2),
+        lambda: VecMonitor(AVPVecEnv(agents=2, simulator=Corridor(), settings=SETTINGS)),
+        pytest.param(lambda: SubprocVecEnv(others(), start_method="forkserver"), marks=pytest.mark.slow),
+    ],
+    ids=["dummy", "monitor", "normalize", "stack", "batch", "processes"],
+)
+def test_figures_come_through_every_vector_environment_and_wrapper(wrapped):
+    env, notes = wrapped(), Notes()
+    try:
+        ppo(env, n_steps=32).learn(64, callback=[MetricsCallback(), notes])
+    finally:
+        env.close()
+    assert len(notes.episodes) >= 2 * 2
+    assert notes.held[-1]["avp/coverage"] == pytest.approx(np.mean([each["coverage"] for each in notes.episodes]))
+
+
+@pytest.mark.parametrize("make", [DQN, SAC])
+def test_off_policy_algorithms_have_the_figures_too(make):
+    class Continuous(gymnasium.ActionWrapper):
+        action_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+        def action(self, action):
+            return int((action[0] + 1) * 2.99)
+
+    env = Other(SmallEnv()) if make is DQN else Continuous(Other(SmallEnv()))
+    notes, dumps = Notes(), []
+    model = make("MlpPolicy", env, learning_starts=1000, seed=3, device="cpu")
+    model.set_logger(Logger(None, []))
+    model.logger.dump = lambda step=0: dumps.append(dict(model.logger.name_to_value))
+    model.learn(40, callback=[MetricsCallback(), notes])
+    # They log after every fourth episode.
+    assert len(dumps) == 1
+    assert dumps[0]["avp/coverage"] == pytest.approx(np.mean([each["coverage"] for each in notes.episodes[:4]]))
 
 
 def test_a_reward_part_that_disappears_is_named():
