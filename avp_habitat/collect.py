@@ -24,6 +24,10 @@ from avp_habitat.rollout_capture import capture_heldout, capture_step, publish_r
 from avp_habitat.rollout_writer import RolloutWriter
 from avp_habitat.settings import TaskSettings
 from avp_habitat.simulators import SIMULATOR_NAMES, make_simulator
+from avp_habitat.tracking.addresses import TrackingError, address_of, shown
+from avp_habitat.tracking.early import open_store
+from avp_habitat.tracking.looking import about_run
+from avp_habitat.tracking.rollout_run import command_for, rollout_run
 
 
 @dataclass(frozen=True)
@@ -109,11 +113,18 @@ def _parser() -> argparse.ArgumentParser:
     add("--width", default=640, type=int, help="of the pictures in pixels (default: %(default)s)")
     add("--height", default=480, type=int, help="of the pictures in pixels (default: %(default)s)")
     add("--stochastic", action="store_true", help="sample a model's actions instead of taking the likeliest")
+    add(
+        "--mlflow",
+        default="auto",
+        metavar="ADDRESS",
+        help="log the rollout as an MLflow run below that of the policy's training, at an address such as "
+        "sqlite:///mlflow.db; auto: MLFLOW_TRACKING_URI if that is set, else nowhere; off: nowhere "
+        "(default: %(default)s)",
+    )
     return parser
 
 
-def _request(argv: Sequence[str]) -> Request:
-    options = _parser().parse_args(argv)
+def _request(options: argparse.Namespace) -> Request:
     for name in ("width", "height"):
         if not 8 <= getattr(options, name) <= 8192:
             raise UsageError(f"--{name}: expected 8 to 8192 pixels, got {getattr(options, name)}")
@@ -132,16 +143,32 @@ def _request(argv: Sequence[str]) -> Request:
     )
 
 
+def _track(out: Path, option: str) -> None:
+    """Log the rollout; a store that fails is a warning, because the rollout is complete and can be logged later."""
+    address = address_of(option, default=None)
+    if address is None:
+        return
+    try:
+        print(about_run(rollout_run(address, out), address))
+    except TrackingError as error:
+        print(f"warning: {error}; the rollout is complete, log it later: {command_for(out, option)}", file=sys.stderr)
+
+
 def main(argv: Sequence[str]) -> None:
     """Collect one rollout; print its figures and what to run next."""
-    request = _request(argv)
+    options = _parser().parse_args(argv)
+    request = _request(options)
+    if options.mlflow not in ("auto", "off"):
+        open_store(options.mlflow)
     episode = collect(request)
     out = shlex.quote(str(request.out))
     print(f"{request.out}: {episode['views']:.0f} views, coverage {100 * episode['coverage']:.1f} %")
     for name, value in episode.items():
         print(f"  {name:<20} {value:.4g}")
+    _track(request.out, options.mlflow)
     print(f"look:         {out}/trajectory.png")
-    print(f"reconstruct:  ns-train avp-nerfacto --data {out}")
+    track = "" if options.mlflow in ("auto", "off") else f" --mlflow {shlex.quote(shown(options.mlflow))}"
+    print(f"reconstruct:  ns-train avp-nerfacto --data {out}{track}")
     print(f"         or:  ns-train nerfacto avp-data --data {out}")
 
 

@@ -14,12 +14,14 @@ from tqdm import tqdm
 
 from avp_habitat import command
 from avp_habitat.errors import RolloutError, UsageError
-from avp_nerfstudio.tracking_mlflow import DEFAULT_ADDRESS, TrackedRun, address_of, connect, open_run, shown
+from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, address_of
+from avp_habitat.tracking.early import open_store
+from avp_habitat.tracking.looking import about_run
+from avp_nerfstudio.tracking_mlflow import open_again
 from avp_nerfstudio.trained_run import TrainedRun, config_path, open_trained, read_config
 
 if TYPE_CHECKING:
-    from mlflow import MlflowClient
-
+    from avp_habitat.tracking.run import TrackedRun as MLflowRun
     from avp_nerfstudio.heldout_views import HeldoutView
     from avp_nerfstudio.tracking_rerun import ReconstructionRecording
 
@@ -55,6 +57,8 @@ class Logged:
     """Scores by view, JSON."""
     run_id: str | None
     """MLflow run."""
+    delivered: bool = True
+    """Whether MLflow has all of it."""
 
 
 def log(request: Request) -> Logged:
@@ -69,7 +73,8 @@ def log(request: Request) -> Logged:
     # nerfstudio's scripts come first: its modules import each other in circles, and this way round is its own.
     import nerfstudio.scripts.eval  # noqa: F401
 
-    client = connect(request.mlflow) if request.mlflow else None
+    if request.mlflow:
+        open_store(request.mlflow)  # before anything is rendered, which takes long
     config = read_config(request.config)
     _make_folder(request.output)
     trained = open_trained(config)
@@ -77,8 +82,10 @@ def log(request: Request) -> Logged:
         rows, pictures = _render(request, trained, recording)
     table = request.output / TABLE
     scores = _write_table(table, request, trained, rows)
-    run_id = _track(request, client, trained, scores, [table, *pictures]) if client else None
-    return Logged(scores, table, run_id)
+    if not request.mlflow:
+        return Logged(scores, table, None)
+    run_id, delivered = _track(request, request.mlflow, trained, scores, [table, *pictures])
+    return Logged(scores, table, run_id, delivered)
 
 
 def _render(
@@ -131,40 +138,48 @@ def _write_table(path: Path, request: Request, trained: TrainedRun, rows: Sequen
 
 
 def _track(
-    request: Request, client: "MlflowClient", trained: TrainedRun, scores: dict[str, float], files: list[Path]
-) -> str:
+    request: Request, address: str, trained: TrainedRun, scores: dict[str, float], files: list[Path]
+) -> tuple[str, bool]:
+    """The run's id, and whether MLflow has all of it."""
     from avp_nerfstudio.tracking_events import read_events
     from avp_nerfstudio.tracking_facts import facts_of
 
     folder = request.config.parent
     facts = facts_of(trained.config)
-    run = open_run(client, facts, folder=folder, experiment=request.experiment, again=True)
-    with _closing(run):
-        if not run.continued:
+    run, had_one = open_again(address, facts, folder=folder, experiment=request.experiment)
+    with _closing(run) as done:
+        if not had_one:
             for scalar in read_events(folder / trained.config.logging.relative_log_dir, _every(trained.config)):
-                run.scalar(scalar.name, scalar.value, scalar.step, timestamp=scalar.timestamp)
-        for name, value in scores.items():
-            run.scalar(f"eval/{name}", value, trained.step)
-        run.files([request.config, *folder.glob("dataparser_transforms.json")])
-        run.files(files, _ARTIFACTS)
-    return run.run_id
+                run.metrics({scalar.name: scalar.value}, scalar.step, timestamp_ms=int(1000 * scalar.timestamp))
+        run.metrics({f"eval/{name}": value for name, value in scores.items()}, trained.step)
+        for path in (request.config, *folder.glob("dataparser_transforms.json")):
+            run.file(path)
+        for path in files:
+            run.file(path, f"{_ARTIFACTS}/{path.name}")
+    return run.run_id, done.delivered
 
 
 def _every(config: Any) -> int:
     return max(int(config.logging.steps_per_log), 1)
 
 
+@dataclass
+class _Done:
+    """How a run was closed."""
+
+    delivered: bool = False
+    """Whether MLflow has all of it."""
+
+
 @contextlib.contextmanager
-def _closing(run: TrackedRun) -> Iterator[None]:
+def _closing(run: "MLflowRun") -> Iterator[_Done]:
+    done = _Done()
     try:
-        yield
-    except KeyboardInterrupt:
-        run.close("KILLED")
+        yield done
+    except BaseException as error:
+        run.close("KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED")
         raise
-    except BaseException:
-        run.close("FAILED")
-        raise
-    run.close("FINISHED")
+    done.delivered = run.close("FINISHED")
 
 
 @contextlib.contextmanager
@@ -217,8 +232,8 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--experiment",
         metavar="NAME",
-        help="MLflow experiment of a new run (default: that of the policy's run, below which this one then appears, "
-        "else avp)",
+        help="MLflow experiment of a new run (default: that of the rollout's run, below which this one then appears: "
+        "the one in which its policy was trained, else avp)",
     )
     add("--rerun", type=Path, metavar="FILE", help="write a Rerun recording (.rrd) to this file, which must not exist")
     add("--pictures", type=int, metavar="N", help="keep pictures of N views, evenly spread (default: all)")
@@ -253,8 +268,7 @@ def main(argv: Sequence[str]) -> None:
     if request.rerun is not None:
         print(f"recording:          rerun {shlex.quote(str(request.rerun))}")
     if request.mlflow and logged.run_id:
-        print(f"MLflow run:         {logged.run_id}")
-        print(f"compare:            mlflow ui --backend-store-uri {shlex.quote(shown(request.mlflow))}")
+        print(about_run(logged.run_id, request.mlflow, delivered=logged.delivered))
 
 
 if __name__ == "__main__":

@@ -1,19 +1,23 @@
 """What follows a training while it runs: an MLflow run, a Rerun recording, both or neither."""
 
+import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from nerfstudio.utils import writer
 
-from avp_nerfstudio.tracking_events import ScalarWriter
+from avp_habitat.tracking.addresses import shown
+from avp_habitat.tracking.journal import spool_folder
+from avp_habitat.tracking.looking import about_run
+from avp_habitat.tracking.recovery import Recovered, recover_in_background
+from avp_habitat.tracking.run import Status, TrackedRun
+from avp_nerfstudio.tracking_events import ScalarWriter, Sink
 from avp_nerfstudio.tracking_facts import facts_of
-from avp_nerfstudio.tracking_mlflow import Status, TrackedRun, open_run, remembered_id
+from avp_nerfstudio.tracking_mlflow import open_run, remembered_id
 from avp_nerfstudio.tracking_rerun import ReconstructionRecording
 
-if TYPE_CHECKING:
-    from mlflow import MlflowClient
-
 _FILES = ("config.yml", "dataparser_transforms.json")
+_log = logging.getLogger(__name__)
 
 
 class Trackers:
@@ -26,28 +30,35 @@ class Trackers:
         self._writer: ScalarWriter | None = None
 
     @classmethod
-    def of(cls, config: Any, client: "MlflowClient | None", pipeline: Any) -> "Trackers":
+    def of(cls, config: Any, address: str | None, pipeline: Any) -> "Trackers":
         """Open what a training's options ask for.
 
         Args:
             config: `AVPTrainerConfig`.
-            client: of the MLflow store, None for no run.
+            address: of the MLflow store, None for no run.
             pipeline: nerfstudio's; its cameras go into the recording.
 
         Raises:
             AVPError: the store or the recording cannot be used.
         """
         recording = start_recording(config.rerun, pipeline) if config.rerun is not None else None
-        if client is None:
+        if address is None:
             return cls(None, recording)
-        run = open_run(client, facts_of(config), folder=config.get_base_dir(), experiment=config.mlflow_experiment)
-        if config.load_dir is not None and (earlier := remembered_id(config.load_dir.parent)) is not None:
-            client.set_tag(run.run_id, "avp.continued_from", earlier)
+        run = open_run(
+            address,
+            facts_of(config),
+            folder=config.get_base_dir(),
+            experiment=config.mlflow_experiment,
+            earlier=remembered_id(config.load_dir.parent) if config.load_dir is not None else None,
+        )
+        recover_in_background(spool_folder(), _tell_recovered)
         return cls(run, recording)
 
     def listen(self, every: int) -> None:
         """Take nerfstudio's numbers from now on, those of each iteration only `every` so many."""
-        sinks = [tracker.scalar for tracker in (self._run, self._recording) if tracker is not None]
+        sinks: list[Sink] = [] if self._recording is None else [self._recording.scalar]
+        if (run := self._run) is not None:
+            sinks.append(lambda name, value, step: run.metrics({name: value}, step))
         if sinks:
             self._writer = ScalarWriter(sinks, every)
             writer.EVENT_WRITERS.append(self._writer)
@@ -68,8 +79,16 @@ class Trackers:
             recording.close()
             print(f"recording: {recording.path}")
         if run is not None:
-            run.close(status, files=[folder / name for name in _FILES if (folder / name).is_file()])
-            print(f"MLflow run {run.run_id}")
+            for path in (folder / name for name in _FILES):
+                if path.is_file():
+                    run.file(path)
+            delivered = run.close(status)
+            print(about_run(run.run_id, run.address, delivered=delivered))
+
+
+def _tell_recovered(recovered: Recovered) -> None:
+    state = ("closed as KILLED" if recovered.killed else "completed") if recovered.delivered else "still not sent"
+    _log.warning("MLflow run %s of an earlier program, at %s: %s", recovered.run_id, shown(recovered.address), state)
 
 
 def start_recording(path: Path, pipeline: Any) -> ReconstructionRecording:

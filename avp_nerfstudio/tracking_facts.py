@@ -1,20 +1,18 @@
-"""What a reconstruction's MLflow run says of itself besides the course of the training: settings, origin, versions."""
+"""What a reconstruction's MLflow run says of itself besides the course of the training: settings and origin."""
 
 import dataclasses
-import math
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from avp_habitat.provenance import flat, git_commit
+from avp_habitat.provenance import flat
 from avp_habitat.rollout import read_meta
-from avp_habitat.versions import installed_versions
+from avp_habitat.tracking import rollout_facts
+from avp_habitat.tracking.names import safe_name
 
-PACKAGES = ("avp-suite", "nerfstudio", "torch", "torchvision", "torchmetrics", "numpy", "mlflow")
-_BRACKETS, _UNSAFE = re.compile(r"[()\[\]{}]"), re.compile(r"[^\w.\- /]")
-_MAX_NAME, _MAX_PARAM, _MAX_TAG = 250, 6000, 5000
+METHOD_TAG = "avp.method"
+_MAX_TAG = 5000
 # Of no meaning for the result; `mlflow` is an address, which may hold a password.
 _NOT_SETTINGS = ("viewer.", "mlflow", "rerun", "logging.local_writer.", "load_config")
 
@@ -25,14 +23,16 @@ class Facts:
 
     name: str
     """Of the run."""
-    params: dict[str, str]
+    params: Mapping[str, str] = field(default_factory=dict)
     """The settings, flat."""
-    tags: dict[str, str]
-    """Versions, commit, scene, policy."""
-    metrics: dict[str, float] = field(default_factory=dict)
+    tags: Mapping[str, str] = field(default_factory=dict)
+    """Method, scene, policy."""
+    metrics: Mapping[str, float] = field(default_factory=dict)
     """The figures of the rollout it was made from: `eval/...`, or `rollout/...` when it is not the whole of one."""
-    policy_run: str | None = None
-    """MLflow run in which the rollout's policy was trained; None for none or several."""
+    rollouts: tuple[Path, ...] = ()
+    """Folders of the rollouts."""
+    policy_runs: tuple[str, ...] = ()
+    """MLflow runs in which the rollouts' policies were trained, each once."""
 
 
 def facts_of(config: Any) -> Facts:
@@ -42,30 +42,32 @@ def facts_of(config: Any) -> Facts:
         config: nerfstudio's `TrainerConfig`; its rollout, if it has one, is still where it says.
 
     Raises:
-        RolloutError: `rollout.json` cannot be read.
+        RolloutError: `rollout.json` or `steps.csv` cannot be read.
     """
     config.set_experiment_name()
-    tags = {f"version.{name}": version for name, version in installed_versions(PACKAGES).items()}
-    tags["avp.method"] = str(config.method_name)
-    if (commit := git_commit()) is not None:
-        tags["mlflow.source.git.commit"] = commit
+    tags = {METHOD_TAG: str(config.method_name), rollout_facts.KIND_TAG: rollout_facts.RECONSTRUCTION}
     name = f"{config.method_name} {config.experiment_name}"
-    folders = rollout_folders(config)
+    folders = tuple(rollout_folders(config))
     if not folders:
         return Facts(name, settings(config), tags)
     metas = [read_meta(folder) for folder in folders]
-    policy_runs = {meta["mlflow_run_id"]: None for meta in metas if meta.get("mlflow_run_id")}
-    tags |= {"avp.rollout": _joined(folders), **_origin(metas[0])}
+    ids = [rollout_facts.policy_run_id(folder, meta) for folder, meta in zip(folders, metas, strict=True)]
+    policy_runs = tuple(dict.fromkeys(run_id for run_id in ids if run_id is not None))
+    tags |= rollout_facts.origin(metas[0]) | {
+        rollout_facts.ROLLOUT_TAG: joined(folders),
+        rollout_facts.ROLLOUT_ID_TAG: joined(map(rollout_facts.rollout_id, folders)),
+    }
     if policy_runs:
-        tags["avp.policy_run"] = _joined(policy_runs)
+        tags[rollout_facts.POLICY_RUN_TAG] = joined(policy_runs)
     # The figures of a rollout are those of all its frames and of no others.
     prefix = "eval" if _is_whole(config) else "rollout"
     return Facts(
         name,
-        settings(config) | _rollout_params(metas[0]),
+        settings(config) | rollout_facts.rollout_params(metas[0]),
         tags,
-        _figures(metas[0], prefix),
-        next(iter(policy_runs)) if len(policy_runs) == 1 else None,
+        rollout_facts.figures(metas[0], prefix),
+        folders,
+        policy_runs,
     )
 
 
@@ -85,28 +87,15 @@ def settings(config: Any) -> dict[str, str]:
     """All settings of a configuration by dotted name, without those that cannot change the result."""
     leaves = flat(dataclasses.asdict(config))
     return {
-        safe_name(key): str(value)[:_MAX_PARAM]
+        safe_name(key): str(value)
         for key, value in leaves.items()
         if not key.startswith(_NOT_SETTINGS) and not key.endswith("_target")
     }
 
 
-def safe_name(name: str) -> str:
-    """A name that MLflow takes: nerfstudio's brackets go, other unusual characters become `_`."""
-    parts = _UNSAFE.sub("_", _BRACKETS.sub("", name)).split("/")
-    return "/".join(part for part in parts if part not in ("", ".", ".."))[:_MAX_NAME] or "_"
-
-
-def _origin(meta: Mapping[str, Any]) -> dict[str, str]:
-    """Tags of a rollout, named as those of the policy's training are."""
-    leaves = flat({key: meta[key] for key in ("scene", "policy", "simulator") if isinstance(meta.get(key), Mapping)})
-    named = {
-        "avp.scene": leaves.get("scene.name"),
-        "avp.scene_digest": leaves.get("scene.sha256"),
-        "avp.policy": leaves.get("policy.name"),
-        "avp.simulator": leaves.get("simulator.name"),
-    }
-    return {key: str(value)[:_MAX_TAG] for key, value in named.items() if value is not None}
+def joined(values: Iterable[object]) -> str:
+    """Several values as one tag."""
+    return ", ".join(map(str, values))[:_MAX_TAG]
 
 
 def _is_whole(config: Any) -> bool:
@@ -114,25 +103,3 @@ def _is_whole(config: Any) -> bool:
     parser = getattr(config.pipeline.datamanager, "dataparser", None)
     usual = (("also", ()), ("every", 1), ("max_views", 0))
     return all(getattr(parser, option, value) == value for option, value in usual)
-
-
-def _joined(values: Iterable[object]) -> str:
-    return ", ".join(map(str, values))[:_MAX_TAG]
-
-
-def _rollout_params(meta: Mapping[str, Any]) -> dict[str, str]:
-    chosen = ("policy", "seed", "reward", "budget", "counts", "heldout", "created")
-    leaves = flat({key: meta[key] for key in chosen if key in meta})
-    return {safe_name(f"rollout.{key}"): str(value)[:_MAX_PARAM] for key, value in leaves.items()}
-
-
-def _figures(meta: Mapping[str, Any], prefix: str) -> dict[str, float]:
-    """`eval/coverage`, `eval/views`, ...: the names under which the policy's evaluation logs them."""
-    metrics = meta.get("metrics")
-    if not isinstance(metrics, Mapping):
-        return {}
-    return {
-        safe_name(f"{prefix}/{name}"): float(value)
-        for name, value in metrics.items()
-        if isinstance(value, (int, float)) and math.isfinite(value)
-    }

@@ -16,9 +16,11 @@ from nerfstudio.utils import comms
 
 from avp_habitat.command import INTERRUPTED
 from avp_habitat.errors import AVPError
+from avp_habitat.tracking.addresses import address_of
+from avp_habitat.tracking.early import open_store
+from avp_habitat.tracking.run import Status
 from avp_nerfstudio.interruption import Interruption
 from avp_nerfstudio.tracking import Trackers
-from avp_nerfstudio.tracking_mlflow import Status, address_of, connect
 from avp_nerfstudio.trained_run import loading_fault, newest_checkpoint
 from avp_nerfstudio.training_progress import TrainingProgress
 
@@ -43,11 +45,11 @@ class AVPTrainerConfig(TrainerConfig):
     _target: type = field(default_factory=lambda: AVPTrainer)
     mlflow: str = "auto"
     """Where MLflow keeps the run: an address such as sqlite:///mlflow.db; auto: MLFLOW_TRACKING_URI if that is set,
-    else nowhere; off: nowhere. Give a server's password in MLFLOW_TRACKING_PASSWORD, since options are written to
-    config.yml."""
+    else nowhere; off: nowhere. AVP_MLFLOW_OFFLINE=1 trains without it and sends everything later. Give a server's
+    password in MLFLOW_TRACKING_PASSWORD, since options are written to config.yml."""
     mlflow_experiment: str | None = None
-    """MLflow experiment; by default that of the run in which the rollout's policy was trained, below which this run
-    then appears, else `avp`."""
+    """MLflow experiment; by default that of the rollout's run, below which this run then appears: the one in which the
+    rollout's policy was trained, else `avp`."""
     rerun: Path | None = None
     """Write a Rerun recording of losses and cameras to this file (.rrd), which must not exist."""
 
@@ -103,11 +105,12 @@ class AVPTrainer(Trainer):
         try:
             with _as_training_error():
                 address = address_of(self.config.mlflow, default=None) if comms.is_main_process() else None
-                client = connect(address) if address else None
+                if address is not None:
+                    open_store(address)  # before the pipeline is built, which takes long
                 super().setup(test_mode)
                 self._fit_schedules()
                 if comms.is_main_process():
-                    self._trackers = Trackers.of(self.config, client, self.pipeline)
+                    self._trackers = Trackers.of(self.config, address, self.pipeline)
         except KeyboardInterrupt:
             raise SystemExit(INTERRUPTED) from None
 

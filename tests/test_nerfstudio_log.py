@@ -67,7 +67,8 @@ def log(*arguments):
 
 
 def runs(client):
-    return client.search_runs([experiment.experiment_id for experiment in client.search_experiments()])
+    experiments = [experiment.experiment_id for experiment in client.search_experiments()]
+    return client.search_runs(experiments, "tags.avp.kind = 'reconstruction'")
 
 
 def made_up_view(scores):

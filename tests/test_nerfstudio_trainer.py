@@ -15,10 +15,9 @@ from nerfstudio_training import tiny_config, train
 from rrd import entities, rows, verify
 
 from avp_habitat.errors import AVPError
-from avp_habitat.provenance import flat
 from avp_nerfstudio.interruption import Interruption
-from avp_nerfstudio.tracking_facts import Facts, facts_of, rollout_folders, safe_name
-from avp_nerfstudio.tracking_mlflow import TrackingError, connect, open_run, shown
+from avp_nerfstudio.tracking_facts import facts_of, rollout_folders
+from avp_nerfstudio.tracking_mlflow import open_run, remembered_id
 from avp_nerfstudio.trainer import AVPTrainer, AVPTrainerConfig, TrainingError
 from avp_nerfstudio.training_progress import TrainingProgress
 
@@ -33,8 +32,9 @@ def store(tmp_path, monkeypatch):
     return MlflowClient(mlflow_home(tmp_path, monkeypatch))
 
 
-def runs(client):
-    return client.search_runs([experiment.experiment_id for experiment in client.search_experiments()])
+def runs(client, kind="reconstruction"):
+    experiments = [experiment.experiment_id for experiment in client.search_experiments()]
+    return client.search_runs(experiments, f"tags.avp.kind = '{kind}'")
 
 
 def tell_origin(room, **facts):
@@ -59,6 +59,7 @@ def test_a_training_is_one_finished_run_with_losses_settings_versions_and_its_co
     tell_origin(room, scene=scene, policy={"name": "oracle"}, seed=3, metrics={"coverage": 0.5, "views": 6.0})
     config = train(tiny_config(room, tmp_path / "out", mlflow="auto"))
     (run,) = runs(store)
+    (above,) = runs(store, "rollout")
     assert run.info.status == "FINISHED"
     assert run.info.run_name == "avp-nerfacto e"
     assert run.info.run_id == (config.parent / "mlflow_run_id.txt").read_text().strip()
@@ -78,31 +79,41 @@ def test_a_training_is_one_finished_run_with_losses_settings_versions_and_its_co
     assert run.data.tags["avp.policy"] == "oracle"
     assert run.data.tags["avp.rollout"] == str(room)
     assert run.data.tags["version.torch"] == torch.__version__.partition("+")[0]
-    assert "mlflow.parentRunId" not in run.data.tags
+    assert run.data.tags["avp.rollout_run"] == run.data.tags["mlflow.parentRunId"] == above.info.run_id
+    assert run.data.tags["avp.rollout_id"] == above.data.tags["avp.rollout_id"]
+    assert "mlflow.parentRunId" not in above.data.tags
     kept = {file.path for file in store.list_artifacts(run.info.run_id)}
     assert kept == {"config.yml", "dataparser_transforms.json"}
 
 
-def test_the_run_is_a_child_of_the_run_that_trained_the_policy(tmp_path, room, store):
+def test_the_run_is_below_its_rollout_and_that_below_the_run_that_trained_the_policy(tmp_path, room, store):
     policies = store.create_experiment("policies")
-    parent = store.create_run(policies).info.run_id
-    store.set_terminated(parent)
-    tell_origin(room, mlflow_run_id=parent)
+    policy = store.create_run(policies).info.run_id
+    store.set_terminated(policy)
+    tell_origin(room, mlflow_run_id=policy)
     train(tiny_config(room, tmp_path / "out", mlflow="auto", iterations=2))
-    (child,) = store.search_runs([policies], f"tags.mlflow.parentRunId = '{parent}'")
-    assert child.data.tags["avp.policy_run"] == parent
-    assert child.info.status == "FINISHED"
+    (rollout,) = store.search_runs([policies], f"tags.mlflow.parentRunId = '{policy}'")
+    (child,) = store.search_runs([policies], f"tags.mlflow.parentRunId = '{rollout.info.run_id}'")
+    assert child.data.tags["avp.policy_run"] == rollout.data.tags["avp.policy_run"] == policy
+    assert (child.info.status, rollout.info.status) == ("FINISHED", "FINISHED")
 
 
-def test_a_policy_run_elsewhere_is_named_without_becoming_the_parent(tmp_path, store):
+def test_runs_above_in_another_experiment_are_named_without_becoming_the_parent(tmp_path, room, store):
     policies = store.create_experiment("policies")
-    parent = store.create_run(policies).info.run_id
-    for policy_run, experiment in (("0" * 32, None), (parent, "other")):
-        facts = Facts("r", {}, {"avp.policy_run": policy_run}, policy_run=policy_run)
-        run = store.get_run(open_run(store, facts, folder=tmp_path, experiment=experiment).run_id)
-        assert store.get_experiment(run.info.experiment_id).name == (experiment or "avp")
+    policy = store.create_run(policies).info.run_id
+    for policy_run, experiment, nested in (("0" * 32, None, True), (policy, "other", False), (policy, None, True)):
+        tell_origin(room, mlflow_run_id=policy_run)
+        config = tiny_config(room, tmp_path)
+        config.pipeline.datamanager.data = room
+        opened = open_run("sqlite:///mlflow.db", facts_of(config), folder=tmp_path, experiment=experiment)
+        opened.close("FINISHED")
+        run = store.get_run(opened.run_id)
+        rollout = store.get_run(run.data.tags["avp.rollout_run"])
+        home = "policies" if policy_run == policy else "avp"
+        assert store.get_experiment(rollout.info.experiment_id).name == home
+        assert store.get_experiment(run.info.experiment_id).name == (experiment or home)
         assert run.data.tags["avp.policy_run"] == policy_run
-        assert "mlflow.parentRunId" not in run.data.tags
+        assert (run.data.tags.get("mlflow.parentRunId") == rollout.info.run_id) is nested
 
 
 def test_an_interrupted_training_saves_what_it_learned_and_goes_on_from_there(
@@ -122,13 +133,26 @@ def test_an_interrupted_training_saves_what_it_learned_and_goes_on_from_there(
     assert [m.step for m in store.get_metric_history(killed.info.run_id, "Train Loss")] == [0, 5]
     told = capsys.readouterr().err
     assert f"--load-dir {checkpoint.parent} --data {room} --max-num-iterations 22\n" in told
-    again = tiny_config(room, tmp_path / "out", mlflow="auto", iterations=22, load_dir=checkpoint.parent)
-    again.timestamp = "again"
-    config = train(again)
+    config = go_on(room, tmp_path, checkpoint.parent, iterations=22)
     assert [path.name for path in (config.parent / "nerfstudio_models").iterdir()] == ["step-000000029.ckpt"]
-    (resumed,) = (run for run in runs(store) if run.info.run_id != killed.info.run_id)
-    assert resumed.data.tags["avp.continued_from"] == killed.info.run_id
-    assert [m.step for m in store.get_metric_history(resumed.info.run_id, "Train Loss")] == [10, 15, 20, 25]
+    (resumed,) = runs(store)
+    assert resumed.info.run_id == killed.info.run_id == remembered_id(config.parent)
+    assert resumed.info.status == "FINISHED"
+    losses = store.get_metric_history(resumed.info.run_id, "Train Loss")
+    assert [metric.step for metric in losses] == [0, 5, 10, 15, 20, 25]
+    assert json.loads(resumed.data.tags["avp.changed_params"])["max_num_iterations"] == ["30", "22"]
+    # One that is finished is not opened again.
+    models = config.parent / "nerfstudio_models"
+    another = go_on(room, tmp_path, models, iterations=1, timestamp="another")
+    (new,) = (run for run in runs(store) if run.info.run_id != resumed.info.run_id)
+    assert remembered_id(another.parent) == new.info.run_id
+    assert new.data.tags["avp.continued_from"] == resumed.info.run_id
+
+
+def go_on(room, folder, checkpoints, *, timestamp="again", **options):
+    config = tiny_config(room, folder / "out", mlflow="auto", load_dir=checkpoints, **options)
+    config.timestamp = timestamp
+    return train(config)
 
 
 def test_a_second_interruption_ends_at_once_without_a_half_trained_checkpoint(tmp_path, room, monkeypatch, capsys):
@@ -197,13 +221,6 @@ def test_the_settings_survive_config_yml(tmp_path):
     assert read == config
 
 
-def test_names_become_what_mlflow_takes():
-    assert safe_name("Train Iter (time)") == "Train Iter time"
-    assert safe_name("Eval Images Metrics Dict (all images)/psnr") == "Eval Images Metrics Dict all images/psnr"
-    assert safe_name("../a//b:c") == "a/b_c"
-    assert flat({"a": {"b": 1, "c": {"d": 2}}, "e": 3}) == {"a.b": 1, "a.c.d": 2, "e": 3}
-
-
 def test_data_that_is_no_rollout_has_no_origin(tmp_path, room):
     config = tiny_config(room, tmp_path)
     config.pipeline.datamanager.data = room / "rollout.json"
@@ -221,7 +238,7 @@ def test_figures_of_rollouts_are_not_taken_for_those_of_a_part_or_of_several(tmp
     for folder, policy_run in ((room, "1" * 32), (other, "2" * 32)):
         tell_origin(folder, metrics={"coverage": 0.5}, mlflow_run_id=policy_run)
     assert facts_of(config).metrics == {"eval/coverage": 0.5}
-    assert facts_of(config).policy_run == "1" * 32
+    assert facts_of(config).policy_runs == ("1" * 32,)
     parser.max_views = 3
     assert facts_of(config).metrics == {"rollout/coverage": 0.5}
     parser.max_views, parser.also = 0, (other,)
@@ -229,25 +246,7 @@ def test_figures_of_rollouts_are_not_taken_for_those_of_a_part_or_of_several(tmp
     assert facts.metrics == {"rollout/coverage": 0.5}
     assert facts.tags["avp.rollout"] == f"{room}, {other}"
     assert facts.tags["avp.policy_run"] == f"{'1' * 32}, {'2' * 32}"
-    assert facts.policy_run is None
-
-
-def test_a_store_that_fails_later_costs_a_warning(tmp_path, store):
-    run = open_run(store, Facts("r", {}, {}), folder=tmp_path)
-    run.scalar("Train Loss", 1.0, 0)
-    (tmp_path / "mlflow.db").unlink()
-    (tmp_path / "mlflow.db").mkdir()
-    with pytest.warns(UserWarning, match=f"MLflow run {run.run_id}"):
-        run.close("FINISHED")
-    with pytest.raises(TrackingError, match="did not take"):
-        run.files([tmp_path / "none"])
-
-
-def test_an_address_is_shown_without_its_password():
-    assert shown("postgresql://me:secret@host/db") == "postgresql://host/db"
-    assert shown("sqlite:///mlflow.db") == "sqlite:///mlflow.db"
-    with pytest.raises(TrackingError, match=r"expected an address such as sqlite:///mlflow\.db, or off"):
-        connect("nonsense://me:secret@host")
+    assert facts.policy_runs == ("1" * 32, "2" * 32)
 
 
 def test_an_interruption_nobody_looks_for_interrupts_at_once():
