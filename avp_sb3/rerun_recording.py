@@ -1,59 +1,103 @@
-"""Rollouts as Rerun recordings."""
+"""Rollouts as one Rerun recording: its bytes, or a file (`python -m avp_sb3.rerun_recording ROLLOUT … --out FILE`)."""
 
-import csv
+import argparse
 import os
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
+from tqdm import tqdm
 
-from avp_habitat import images
+from avp_habitat.command import run
 from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.rollout import Rollout, read_rollout
-from avp_habitat.settings import ACTION_NAMES
-from avp_sb3.rerun_episode import EncodedView, Episode, encode_jpeg, log_episode
-from avp_sb3.rerun_layout import open_recording
+from avp_sb3.rerun_destination import Destination, DestinationRecording
+from avp_sb3.rerun_episode import log_episode
+from avp_sb3.rerun_paths import rollouts_at
+from avp_sb3.rerun_rollout import PICTURES, Progress, RolloutContents, pictured, read_contents
+from avp_sb3.rerun_rollout_layout import rollout_blueprint
+from avp_sb3.rerun_room import log_room
 
-_MAP_FILE = "trajectory.png"
+_MOST_PICTURES = 400
+_FLUSH_S = 60
 
 
-def record_rollout(recording: rr.RecordingStream, rollout: Rollout, root: str = "") -> None:
-    """Add a rollout as episode 0, with all its pictures and its map.
-
-    The floor's cells are not in a rollout folder; its top-down map appears as the picture `map` instead.
+def log_rollout(recording: rr.RecordingStream, root: str, contents: RolloutContents) -> None:
+    """Add a rollout as episode 0, with its pictures, room, map and figures.
 
     Args:
         recording: where to.
-        rollout: as read by `avp_habitat.rollout.read_rollout`.
-        root: entity path above `world`, `plots` and `map`.
+        root: entity path above `world`, `plots`, `metrics`, `map` and `about`.
+        contents: of the rollout.
+    """
+    log_episode(recording, root, contents.episode, number=0)
+    log_room(recording, f"{root}/world/room", *contents.room)
+    if contents.map is not None:
+        recording.log(f"{root}/map", rr.EncodedImage(contents=contents.map, media_type="image/png"), static=True)
+    about = rr.TextDocument(contents.about, media_type=rr.MediaType.MARKDOWN)
+    recording.log(f"{root}/about", about, static=True)
+    last = max(len(contents.episode.camera_to_world) - 1, 0)
+    for timeline, value in (("step", last), ("episode", 0), ("env_step", 0)):
+        recording.set_time(timeline, sequence=value)
+    for name, value in contents.metrics.items():
+        recording.log(f"{root}/metrics/{_metric_path(name)}", rr.Scalars(value))
+    recording.reset_time()
+
+
+def recording_bytes(
+    rollouts: Sequence[Rollout],
+    destination: Destination,
+    *,
+    always_named: bool = False,
+    progress: Progress = lambda: None,
+) -> bytes:
+    """A recording of rollouts in the format of `.rrd` files.
+
+    All is read before anything is written, so that a damaged rollout leaves nothing that looks like a recording.
+
+    Args:
+        rollouts: as read by `avp_habitat.rollout.read_rollout`. Several lie under their folders' names, and share
+            at most 400 pictures; one has at most 100.
+        destination: what they become part of.
+        always_named: one rollout lies under its folder's name too.
+        progress: called after each picture.
 
     Raises:
-        RolloutError: a file of the rollout cannot be read, or `steps.csv` is not one row of numbers per frame.
+        RolloutError: a rollout is damaged.
     """
-    rows = _read_steps(rollout)
-    poses = np.array([view.camera_to_world for view in rollout.frames]).reshape(-1, 4, 4)
-    try:
-        views = {
-            step: EncodedView(encode_jpeg(images.read_rgb(view.image)), view.depth.read_bytes())
-            for step, view in enumerate(rollout.frames)
-        }
-    except OSError as error:
-        raise RolloutError(f"{rollout.folder}: expected readable pictures: {error}") from None
-    episode = Episode(poses, _feet(rows), rollout.intrinsics, views, _plots(rows))
-    log_episode(recording, root, episode, number=0)
-    if (rollout.folder / _MAP_FILE).is_file():
-        recording.log(f"{root}/map", rr.EncodedImage(path=rollout.folder / _MAP_FILE), static=True)
+    names = _unique_names([rollout.folder.resolve().name for rollout in rollouts])
+    above = f"/{destination.prefix.strip('/')}".rstrip("/")
+    roots = [f"{above}/{rr.escape_entity_path_part(name)}" for name in names]
+    if len(rollouts) == 1 and not always_named:
+        roots = [above]
+    pictures = _pictures_of_each(rollouts)
+    contents = [read_contents(rollout, pictures=pictures, progress=progress) for rollout in rollouts]
+    recording = DestinationRecording(destination)
+    stream = recording.binary_stream()
+    if destination.own:
+        with_map = any(each.map is not None for each in contents)
+        blueprint = rollout_blueprint(dict(zip(roots, names, strict=True)), with_map=with_map)
+        recording.send_blueprint(blueprint, make_active=False, make_default=True)
+        recording.send_recording_name(", ".join(names))
+    for root, name, each in zip(roots, names, contents, strict=True):
+        log_rollout(recording, root, each)
+        if len(roots) > 1:
+            recording.log(f"{root}/plots/coverage", rr.SeriesLines(names=[name]), static=True)
+    written = stream.read(flush=True, flush_timeout_sec=_FLUSH_S)
+    if not written:
+        raise RolloutError("the recording could not be encoded: expected its bytes, got none")
+    return written
 
 
-def write_rollout_recording(folders: Sequence[Path], target: Path) -> Path:
+def write_rollout_recording(folders: Sequence[str | Path], target: str | Path, *, progress: bool = False) -> Path:
     """Write one `.rrd` file with each rollout under its folder's name; the file appears when it is whole.
 
     Args:
         folders: rollout folders.
         target: the file to make.
+        progress: show a progress bar.
 
     Raises:
         UsageError: the target exists, or no folder is given.
@@ -64,17 +108,13 @@ def write_rollout_recording(folders: Sequence[Path], target: Path) -> Path:
         raise UsageError("expected at least one rollout folder, got none")
     _refuse_existing(target)
     rollouts = [read_rollout(folder) for folder in folders]
-    names = _unique_names([rollout.folder.resolve().name for rollout in rollouts])
-    roots = [f"/{rr.escape_entity_path_part(name)}" for name in names]
+    total = sum(len(pictured(rollout, _pictures_of_each(rollouts))) for rollout in rollouts)
+    with tqdm(total=total, unit="picture", desc=f"recording {target}", disable=None if progress else True) as bar:
+        written = recording_bytes(rollouts, Destination(), always_named=True, progress=bar.update)
     temporary = target.parent / f".{target.name}.partial-{os.getpid()}"
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        recording = open_recording(temporary, roots, with_map=True)
-        try:
-            for root, rollout in zip(roots, rollouts, strict=True):
-                record_rollout(recording, rollout, root)
-        finally:
-            recording.disconnect()
+        temporary.write_bytes(written)
         _refuse_existing(target)
         temporary.rename(target)
     except OSError as error:
@@ -85,59 +125,41 @@ def write_rollout_recording(folders: Sequence[Path], target: Path) -> Path:
     return target
 
 
-class _Steps:
-    """The rows of `steps.csv`."""
+def main(argv: Sequence[str]) -> None:
+    """Write rollouts to one recording.
 
-    def __init__(self, path: Path, rows: list[dict[str, str]]) -> None:
-        self.path = path
-        self.rows = rows
-        self.names = list(rows[0]) if rows else []
+    Args:
+        argv: the command line's arguments.
 
-    def numbers(self, name: str) -> NDArray[np.float64]:
-        """`(t,)` a column."""
-        try:
-            return np.array([float(row[name]) for row in self.rows])
-        except KeyError:
-            raise RolloutError(f"{self.path}: expected a column {name!r}, found {', '.join(self.names)}") from None
-        except (TypeError, ValueError) as error:
-            raise RolloutError(f"{self.path}: expected numbers in column {name!r}: {error}") from None
-
-    def actions(self) -> NDArray[np.float64]:
-        """`(t,)` the actions' numbers."""
-        unknown = {row.get("action") for row in self.rows} - set(ACTION_NAMES)
-        if unknown:
-            found = ", ".join(sorted(map(repr, unknown)))
-            raise RolloutError(f"{self.path}: expected actions out of {', '.join(ACTION_NAMES)}, found {found}")
-        return np.array([float(ACTION_NAMES.index(row["action"])) for row in self.rows])
+    Raises:
+        AVPError: as `write_rollout_recording`.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m avp_sb3.rerun_recording",
+        description="Write rollouts side by side to one recording; open it with `rerun FILE`.",
+    )
+    parser.add_argument("rollouts", nargs="+", help="rollout folders, or folders of rollouts")
+    parser.add_argument("--out", required=True, type=Path, help="the .rrd file to make; must not exist")
+    options = parser.parse_args(argv)
+    _refuse_existing(options.out, option="--out ")
+    folders = [folder for path in options.rollouts for folder in rollouts_at(path) or [path]]
+    target = write_rollout_recording(folders, options.out, progress=True)
+    print(f"{target}: {len(folders)} rollout{'s' * (len(folders) > 1)}, {target.stat().st_size / 1e6:.1f} MB")
 
 
-def _read_steps(rollout: Rollout) -> _Steps:
-    path = rollout.folder / "steps.csv"
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise RolloutError(f"{path}: expected a table of steps, could not read it: {error}") from None
-    if len(rows) != len(rollout.frames):
-        raise RolloutError(f"{path}: expected one row per frame ({len(rollout.frames)}), found {len(rows)}")
-    return _Steps(path, rows)
+def _metric_path(name: str) -> str:
+    """As the callback's recordings name the figures of their episodes."""
+    group = "return/" if name.startswith("return_") else ""
+    return group + rr.escape_entity_path_part(name.removeprefix("return_"))
 
 
-def _feet(steps: _Steps) -> NDArray[np.float64]:
-    """`(t, 3)` where the agent stood, metres, world frame."""
-    return np.stack([steps.numbers(name) for name in ("x_m", "y_m", "z_m")], axis=-1)
+def _pictures_of_each(rollouts: Sequence[Rollout]) -> int:
+    return max(1, min(PICTURES, _MOST_PICTURES // len(rollouts)))
 
 
-def _plots(steps: _Steps) -> dict[str, NDArray[np.float64]]:
-    """The figures of the steps, named as those of a training's episodes."""
-    parts = {f"reward/{name.removeprefix('reward_')}": name for name in steps.names if name.startswith("reward_")}
-    columns = {"coverage": "coverage", "reward/sum": "reward", **parts}
-    return {"action": steps.actions()} | {plot: steps.numbers(name) for plot, name in columns.items()}
-
-
-def _refuse_existing(target: Path) -> None:
+def _refuse_existing(target: Path, option: str = "") -> None:
     if target.exists() or target.is_symlink():
-        raise UsageError(f"{target}: exists already; choose another name or remove it")
+        raise UsageError(f"{option}{target}: exists already; choose another name or remove it")
 
 
 def _unique_names(names: Sequence[str]) -> list[str]:
@@ -150,3 +172,7 @@ def _unique_names(names: Sequence[str]) -> list[str]:
             candidate = f"{name}-{count}"
         unique.append(candidate)
     return unique
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))
