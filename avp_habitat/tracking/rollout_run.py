@@ -5,6 +5,7 @@ import fcntl
 import os
 import shlex
 import sys
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from avp_habitat.tracking.addresses import (
     experiment_id,
     first_line,
     shown,
+    unreachable,
 )
 from avp_habitat.tracking.looking import how_to_look
 from avp_habitat.tracking.remote import PARENT_TAG, find_run
@@ -57,11 +59,13 @@ def rollout_run(store: "MlflowClient | str", folder: str | Path, *, experiment: 
     rollout = _read(Path(folder))
     client = connect(store) if isinstance(store, str) else store
     try:
-        with _alone(rollout.folder):
+        with _alone(rollout.identity):
             policy = find_run(client, rollout.policy_run)
-            run = _found(client, rollout) or _made(client, rollout, policy, experiment)
-            if run.info.status != "FINISHED":
-                _fill(client, run, rollout)
+            run = _found(client, rollout)
+            if run is None:
+                run = _made(client, rollout, policy, experiment)
+            elif run.info.status != "FINISHED":
+                _fill(client, run.info.run_id, rollout)
             _join_family(client, run, rollout, policy)
     except AVPError:
         raise
@@ -133,6 +137,7 @@ def _made(client: "MlflowClient", rollout: _Rollout, policy: "Run | None", exper
     else:
         identity, _ = experiment_id(client, experiment or DEFAULT_EXPERIMENT)
     ours = client.create_run(identity, run_name=rollout.name, tags=rollout.tags())
+    _fill(client, ours.info.run_id, rollout)
     # MLflow cannot make a run only if there is none: a program on another machine may have made it meanwhile, too.
     first = _found(client, rollout) or ours
     if first.info.run_id != ours.info.run_id:
@@ -140,24 +145,37 @@ def _made(client: "MlflowClient", rollout: _Rollout, policy: "Run | None", exper
     return first
 
 
-def _fill(client: "MlflowClient", run: "Run", rollout: _Rollout) -> None:
-    """Figures, settings and files, and the end; what the run has already, because somebody was killed, is kept."""
+def _fill(client: "MlflowClient", run_id: str, rollout: _Rollout) -> None:
+    """Figures, settings and files, and the end."""
+    from mlflow.exceptions import MlflowException
+
+    try:
+        _log_facts(client, run_id, rollout)
+    except MlflowException:
+        if unreachable(client.tracking_uri):
+            raise
+        # MLflow refuses what somebody else tells it in the same moment; by now it has that.
+        _log_facts(client, run_id, rollout)
+    for name in _ARTIFACTS:
+        if (rollout.folder / name).is_file():
+            client.log_artifact(run_id, os.fspath(rollout.folder / name))
+    client.set_terminated(run_id, "FINISHED")
+
+
+def _log_facts(client: "MlflowClient", run_id: str, rollout: _Rollout) -> None:
+    """What the run does not have already because somebody was killed."""
     from mlflow.entities import Metric, Param
 
-    known, run_id = run.data, run.info.run_id
+    run = client.get_run(run_id)
     # With one time for whoever fills it, a database takes the same figure twice for the same point.
     at = run.info.start_time
     figures = facts.figures(rollout.meta)
     params = facts.rollout_params(rollout.meta)
     client.log_batch(
         run_id,
-        metrics=[Metric(name, value, at, 0) for name, value in figures.items() if name not in known.metrics],
-        params=[Param(name, value[:_MAX_PARAM]) for name, value in params.items() if name not in known.params],
+        metrics=[Metric(name, value, at, 0) for name, value in figures.items() if name not in run.data.metrics],
+        params=[Param(name, value[:_MAX_PARAM]) for name, value in params.items() if name not in run.data.params],
     )
-    for name in _ARTIFACTS:
-        if (rollout.folder / name).is_file():
-            client.log_artifact(run_id, os.fspath(rollout.folder / name))
-    client.set_terminated(run_id, "FINISHED")
 
 
 def _join_family(client: "MlflowClient", run: "Run", rollout: _Rollout, policy: "Run | None") -> None:
@@ -184,20 +202,13 @@ def _replace(client: "MlflowClient", run: "Run", tags: dict[str, str], old: set[
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Keeps other programs of this machine from making the run of the same folder at the same time."""
-    try:
-        descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
-        yield
-        return
-    try:
-        # Some network file systems lock no folders; there, only the later one of two runs is removed again.
+def _alone(identity: str) -> Iterator[None]:
+    """Keeps other programs of this machine from making the run of the same rollout at the same time."""
+    # A handful of locks is enough, and leaves only a handful of files behind.
+    with (Path(tempfile.gettempdir()) / f"avp-rollout-{os.getuid()}-{identity[0]}.lock").open("w") as file:
         with suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            fcntl.flock(file, fcntl.LOCK_EX)
         yield
-    finally:
-        os.close(descriptor)
 
 
 def command_for(folder: Path, option: str) -> str:
