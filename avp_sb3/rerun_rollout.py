@@ -1,6 +1,5 @@
 """A rollout folder read for a Rerun recording, with every fault found before anything is written."""
 
-import io
 import json
 import zlib
 from collections.abc import Callable, Iterator
@@ -16,7 +15,7 @@ from avp_habitat import images
 from avp_habitat.errors import RolloutError
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout import Rollout, View
-from avp_sb3.rerun_episode import EncodedView, Episode, encode_jpeg, spread_indices
+from avp_sb3.rerun_episode import EncodedView, Episode, encode_jpeg, encode_view, spread_indices
 from avp_sb3.rerun_room import room_points
 from avp_sb3.rerun_steps import Steps
 
@@ -97,13 +96,7 @@ def _read_view(view: View, camera: Intrinsics, stride: int) -> tuple[NDArray, ND
     rgb = np.asarray(Image.fromarray(rgb[:height, :width]).reduce(stride))
     # Depth is picked, not averaged: a mean of two surfaces is none.
     depth = np.ascontiguousarray(depth[stride // 2 : height : stride, stride // 2 : width : stride])
-    return rgb, depth, EncodedView(encode_jpeg(rgb), _encode_depth(depth))
-
-
-def _encode_depth(depth: NDArray[np.floating]) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(images.encode_depth(depth)).save(buffer, format="PNG", compress_level=4)
-    return buffer.getvalue()
+    return rgb, depth, encode_view(rgb, depth)
 
 
 def _decoded(path: Path, read: Callable[[Path], _T]) -> _T:

@@ -21,6 +21,7 @@ NAMES = ("rerun-importer-avp", "rerun-loader-avp")
 HEAVY = {"numpy", "rerun", "PIL", "gymnasium", "avp_habitat", "tqdm", "pyarrow", "csv", "json"}
 BARE_PATH = "/usr/bin:/bin"
 ADDED = "Scalars:scalars"
+SLOW = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -380,6 +381,7 @@ def test_a_terminal_is_no_place_for_a_recording(rollout):
     assert re.fullmatch(rb"error: expected the output to go to a viewer or a file: try `rerun .*r0`\n", done.stderr)
 
 
+@SLOW
 def test_a_viewer_that_leaves_is_no_crash(rollout):
     reading, writing = os.pipe()
     os.close(reading)
@@ -392,15 +394,16 @@ def test_a_viewer_that_leaves_is_no_crash(rollout):
 
 
 @pytest.mark.parametrize(
-    "opened",
-    [".", pytest.param("rollout", marks=pytest.mark.slow), pytest.param("rollout.json", marks=pytest.mark.slow)],
+    ("current", "opened"),
+    [
+        ("", "rollout/rollout.json"),
+        pytest.param("", "rollout", marks=SLOW),
+        pytest.param("rollout", ".", marks=SLOW),
+    ],
 )
-def test_rerun_opens_a_rollout_once(rollout, tmp_path, opened):
-    folder = shutil.copytree(rollout, tmp_path / "rollout")
-    where, path = (
-        (folder, ".") if opened == "." else (tmp_path, "rollout" if opened == "rollout" else "rollout/rollout.json")
-    )
-    recording, printed = rerun(path, folder=where, target=tmp_path / "saved.rrd")
+def test_rerun_opens_a_rollout_once(rollout, tmp_path, current, opened):
+    shutil.copytree(rollout, tmp_path / "rollout")
+    recording, printed = rerun(opened, folder=tmp_path / current, target=tmp_path / "saved.rrd")
     verify(recording)
     assert "ERROR" not in printed
     assert actions(recording) == list(ACTIONS)
@@ -408,7 +411,7 @@ def test_rerun_opens_a_rollout_once(rollout, tmp_path, opened):
     assert len(blueprints(recording)) == 1
 
 
-@pytest.mark.slow
+@SLOW
 def test_rerun_opens_a_folder_of_rollouts(rollout, tmp_path):
     for name in ("a", "b"):
         shutil.copytree(rollout, tmp_path / "all" / name)
@@ -419,7 +422,7 @@ def test_rerun_opens_a_folder_of_rollouts(rollout, tmp_path):
     assert len(stores(recording)) == 1
 
 
-@pytest.mark.slow
+@SLOW
 def test_rerun_prints_what_is_wrong_with_a_damaged_rollout(damaged, tmp_path):
     missing_image(damaged)
     recording, printed = rerun("damaged", folder=tmp_path, target=tmp_path / "saved.rrd")
@@ -438,7 +441,7 @@ rr.log("end", rr.TextLog("end"))
 """
 
 
-@pytest.mark.slow
+@SLOW
 def test_an_application_logs_a_rollout_into_its_own_recording(rollout, tmp_path):
     target = tmp_path / "host.rrd"
     environment = {**os.environ, "PATH": f"{SCRIPTS}{os.pathsep}{BARE_PATH}"}
