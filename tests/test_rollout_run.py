@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from mlflow import MlflowClient
-from tracking import mlflow_home
+from tracking import mlflow_home, ppo
 from tracking_server import free_port
 
 from avp_habitat import collect as collecting
@@ -304,3 +304,40 @@ def test_logging_nowhere_is_refused(rollout, capsys):
 def test_importing_the_module_imports_no_mlflow():
     code = "import sys, avp_habitat.collect, avp_habitat.tracking.rollout_run; print('mlflow' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"
+
+
+@pytest.mark.slow  # trains a policy and a reconstruction
+def test_training_rollout_and_reconstruction_are_nested_in_one_experiment(store, tmp_path, capsys):
+    pytest.importorskip("nerfstudio")
+    import nerfstudio.scripts.train  # noqa: F401  before the modules that use it, which import it in circles
+    from nerfstudio_training import tiny_config, train
+
+    import avp_nerfstudio.log
+    from avp_sb3 import MLflowCallback
+
+    callback = MLflowCallback("mine", "a training")
+    model = ppo()
+    model.learn(64, callback=callback)
+    model.save(tmp_path / "model.zip")
+    assert collect("--policy", tmp_path / "model.zip", "--out", tmp_path / "r") == 0
+    config = train(tiny_config(tmp_path / "r", tmp_path / "out", mlflow="auto", iterations=12))
+    assert command.run(avp_nerfstudio.log.main, [str(config), "--pictures", "1"]) == 0
+
+    training = store.get_run(callback.run_id)
+    (rollout,) = runs(store, "tags.avp.kind = 'rollout'")
+    (reconstruction,) = runs(store, "tags.avp.kind = 'reconstruction'")
+    family = [training, rollout, reconstruction]
+    ids = [run.info.run_id for run in family]
+    assert [run.data.tags.get("mlflow.parentRunId") for run in family] == [None, *ids[:2]]
+    assert {store.get_experiment(run.info.experiment_id).name for run in family} == {"mine"}
+    assert {run.info.status for run in family} == {"FINISHED"}
+    tags = reconstruction.data.tags
+    assert (tags["avp.policy_run"], tags["avp.rollout_run"]) == (ids[0], ids[1])
+    assert (tags["avp.policy"], tags["avp.method"]) == ("model.zip", "avp-nerfacto")
+    assert tags["avp.scene"] == rollout.data.tags["avp.scene"] == "builtin:0"
+    assert tags["avp.rollout_id"] == rollout.data.tags["avp.rollout_id"] == rollout_id(tmp_path / "r")
+    for name in ("eval/coverage", "eval/views", "eval/annd_m", "eval/ei", "eval/cpv"):
+        assert reconstruction.data.metrics[name] == rollout.data.metrics[name]
+    assert {"eval/psnr", "eval/ssim", "Train Loss"} <= reconstruction.data.metrics.keys()
+    assert {"heldout", "config.yml"} <= {file.path for file in store.list_artifacts(ids[2])}
+    assert f"compare:  mlflow ui --backend-store-uri {store.tracking_uri}" in capsys.readouterr().out
