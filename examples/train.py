@@ -3,6 +3,7 @@
 import argparse
 import shlex
 import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,8 @@ from avp_habitat import command
 from avp_habitat.errors import UsageError, unknown_name
 from avp_habitat.settings import OBSERVATION_NAMES, TaskSettings
 from avp_sb3.presets import PRESETS, Preset
+
+_MLFLOW = "runs:/"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -27,7 +30,14 @@ def _parser() -> argparse.ArgumentParser:
     add("--height", default=120, type=int, help="of the policy's depth image in pixels")
     add("--seed", default=0, type=int, help="of the policy and the starts")
     add("--out", default=Path("runs/ppo.zip"), type=Path, help="the model; also written after Ctrl-C")
-    add("--resume", default=None, type=Path, metavar="MODEL.zip", help="go on with a model until --steps are done")
+    add(
+        "--resume",
+        default=None,
+        metavar="MODEL",
+        help="go on until --steps are done with a model: a file, or MLflow's runs:/RUN_ID/model.zip",
+    )
+    add("--eval-scene", default=None, nargs="+", metavar="SCENE", help="evaluate in these too, and keep the best model")
+    add("--eval-every", default=100_000, type=int, help="environment steps between two evaluations")
     add("--recording", default=None, type=Path, help="the Rerun recording (.rrd) of some episodes; none when omitted")
     add("--experiment", default="avp", help="of MLflow")
     add("--run-name", default=None, help="of the MLflow run")
@@ -40,6 +50,8 @@ def _preset(options: argparse.Namespace) -> Preset:
         raise unknown_name("observation", options.observation, OBSERVATION_NAMES)
     if options.steps < 1:
         raise UsageError(f"--steps: expected at least 1, got {options.steps}")
+    if options.eval_every < 1:
+        raise UsageError(f"--eval-every: expected at least 1, got {options.eval_every}")
     preset = PRESETS[options.observation]
     buffer = preset.n_envs * preset.n_steps
     agents = preset.n_envs if options.agents is None else options.agents
@@ -53,15 +65,52 @@ def _model(options: argparse.Namespace, preset: Preset, env: Any) -> Any:
 
     if options.resume is None:
         return PPO("MlpPolicy", env, device="cpu", seed=options.seed, **preset.arguments())
-    if not options.resume.is_file():
-        raise UsageError(f"--resume {options.resume}: no such model file")
-    try:
-        model = PPO.load(options.resume, env=env, device="cpu")
-    except ValueError as error:
-        raise UsageError(f"--resume {options.resume}: does not fit these options: {error}") from None
+    with tempfile.TemporaryDirectory() as folder:
+        path = _resumed_file(options.resume, folder)
+        try:
+            model = PPO.load(path, env=env, device="cpu")
+        except ValueError as error:
+            raise UsageError(f"--resume {options.resume}: does not fit these options: {error}") from None
     if model.num_timesteps >= options.steps:
         raise UsageError(f"--steps: {options.resume} has {model.num_timesteps} already; expected more")
     return model
+
+
+def _resumed_file(resume: str, folder: str) -> Path:
+    if not resume.startswith(_MLFLOW):
+        if not Path(resume).is_file():
+            raise UsageError(f"--resume {resume}: no such model file")
+        return Path(resume)
+    import mlflow
+    from mlflow.artifacts import download_artifacts
+    from mlflow.exceptions import MlflowException
+
+    from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, first_line, is_missing, shown
+
+    address = mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else DEFAULT_ADDRESS
+    if is_missing(address):
+        raise UsageError(f"--resume {resume}: no MLflow database at {shown(address)}; set MLFLOW_TRACKING_URI")
+    try:
+        found = download_artifacts(artifact_uri=resume, dst_path=folder, tracking_uri=address)
+    except (MlflowException, OSError) as error:
+        raise UsageError(f"--resume {resume}: not found at {shown(address)}: {first_line(error)}") from None
+    if not Path(found).is_file():
+        raise UsageError(f"--resume {resume}: expected a model file, found a folder; add /model.zip")
+    return Path(found)
+
+
+def _callbacks(options: argparse.Namespace, tracking: Any) -> list[Any]:
+    from avp_sb3 import EvaluationCallback, MetricsCallback, RerunCallback
+
+    callbacks: list[Any] = []
+    # First, so that scenes that cannot be opened leave no empty run behind.
+    if options.eval_scene is not None:
+        best = options.out.with_stem(f"{options.out.stem}-best")
+        callbacks.append(EvaluationCallback(options.eval_scene, every=options.eval_every, best_model=best))
+    callbacks += [MetricsCallback(), tracking]
+    if options.recording is not None:
+        callbacks.append(RerunCallback(options.recording))
+    return callbacks
 
 
 def main(argv: Sequence[str]) -> None:
@@ -80,30 +129,31 @@ def main(argv: Sequence[str]) -> None:
     import torch
     from stable_baselines3.common.vec_env import VecMonitor
 
-    from avp_sb3 import AVPVecEnv, MetricsCallback, MLflowCallback, RerunCallback
+    from avp_sb3 import AVPVecEnv, MLflowCallback
 
     # The policy is a small network: more threads of torch only wait for each other.
     torch.set_num_threads(1)
     env = VecMonitor(AVPVecEnv(options.scene, agents=preset.n_envs, settings=settings, seed=options.seed))
     model = _model(options, preset, env)
     tracking = MLflowCallback(options.experiment, run_name=options.run_name)
-    callbacks = [MetricsCallback(), tracking]
-    if options.recording is not None:
-        callbacks.append(RerunCallback(options.recording))
+    callbacks = _callbacks(options, tracking)
     options.out.parent.mkdir(parents=True, exist_ok=True)
+    begun = model.num_timesteps
     done = False
     try:
         with tracking:
             # With reset_num_timesteps=False, SB3 counts the steps from where the model stands.
-            left = options.steps - model.num_timesteps
-            model.learn(left, callback=callbacks, progress_bar=True, reset_num_timesteps=options.resume is None)
+            model.learn(
+                options.steps - begun, callback=callbacks, progress_bar=True, reset_num_timesteps=options.resume is None
+            )
         done = True
     finally:
-        model.save(options.out)
-        print(f"{options.out}: the policy after {model.num_timesteps} steps; MLflow run {tracking.run_id}")
-        if not done:
-            again = shlex.join(["python", "examples/train.py", *argv, "--resume", str(options.out)])
-            print(f"to go on:  {again}")
+        if model.num_timesteps > begun:
+            model.save(options.out)
+            print(f"{options.out}: the policy after {model.num_timesteps} steps; MLflow run {tracking.run_id}")
+            if not done:
+                again = shlex.join(["python", "examples/train.py", *argv, "--resume", str(options.out)])
+                print(f"to go on:  {again}")
 
 
 if __name__ == "__main__":

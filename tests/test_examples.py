@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -25,7 +26,7 @@ def run(script, *words, folder):
 def test_the_training_script_trains_tracks_and_saves(tmp_path):
     camera = ("--width", 16, "--height", 12)
     words = ("--steps", 2048, "--agents", 16, "--out", "model.zip", "--recording", "training.rrd", *camera)
-    words += ("--run-name", "tiny")
+    words += ("--run-name", "tiny", "--eval-scene", "builtin:1", "--eval-every", 1024)
     done = run("train.py", *words, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "model.zip: the policy after 2048 steps" in done.stdout
@@ -34,6 +35,10 @@ def test_the_training_script_trains_tracks_and_saves(tmp_path):
     (found,) = client.search_runs([client.get_experiment_by_name("avp").experiment_id])
     assert (found.info.run_name, found.info.status) == ("tiny", "FINISHED")
     assert 0 < found.data.metrics["avp/coverage"] < 1
+    evaluated = client.get_metric_history(found.info.run_id, "eval/coverage")
+    assert [point.step for point in evaluated] == [1024, 2048]
+    assert "best_model.zip" in {file.path for file in client.list_artifacts(found.info.run_id)}
+    assert zipfile.is_zipfile(tmp_path / "model-best.zip")
 
     collected = subprocess.run(
         [sys.executable, "-m", "avp_habitat.collect", "--scene", "builtin:0", "--policy", "model.zip", "--budget", "3",
@@ -52,6 +57,8 @@ def test_the_training_script_trains_tracks_and_saves(tmp_path):
         (("--steps", 0), "--steps: expected at least 1, got 0"),
         (("--observation", "maps"), "unknown observation 'maps': expected one of map, numbers; did you mean 'map'?"),
         (("--resume", "no.zip"), "--resume no.zip: no such model file"),
+        (("--resume", "runs:/1/model.zip"), "--resume runs:/1/model.zip: no MLflow database at sqlite:///"),
+        (("--eval-every", 0), "--eval-every: expected at least 1, got 0"),
     ],
 )
 def test_wrong_options_of_the_training_end_before_anything_is_loaded(tmp_path, words, error):
@@ -60,6 +67,36 @@ def test_wrong_options_of_the_training_end_before_anything_is_loaded(tmp_path, w
     assert error in done.stderr
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scene_that_cannot_be_evaluated_ends_before_a_run_or_a_model_is_made(tmp_path):
+    (tmp_path / "model.zip").write_text("an earlier one")
+    words = ("--out", "model.zip", "--width", 16, "--height", 12, "--agents", 16, "--eval-scene", "no.glb")
+    done = run("train.py", *words, folder=tmp_path)
+    assert done.returncode == 1
+    assert "no.glb" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["model.zip"]
+    assert (tmp_path / "model.zip").read_text() == "an earlier one"
+
+
+@pytest.mark.slow
+def test_a_training_goes_on_from_the_model_in_its_mlflow_run(tmp_path):
+    words = ("--agents", 16, "--out", "model.zip", "--width", 16, "--height", 12)
+    first = run("train.py", *words, "--steps", 2048, folder=tmp_path)
+    assert first.returncode == 0, first.stderr
+    client = MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    (found,) = client.search_runs(["1"])
+    (tmp_path / "model.zip").unlink()
+    address = f"runs:/{found.info.run_id}/model.zip"
+    second = run("train.py", *words, "--steps", 4096, "--resume", address, folder=tmp_path)
+    assert second.returncode == 0, second.stderr
+    assert "model.zip: the policy after 4096 steps" in second.stdout
+    for wrong in (f"runs:/{found.info.run_id}/nothing.zip", "runs:/" + "0" * 32 + "/model.zip"):
+        failed = run("train.py", *words, "--resume", wrong, folder=tmp_path)
+        assert failed.returncode == 2
+        assert f"--resume {wrong}: not found at sqlite:///" in failed.stderr
+        assert "Traceback" not in failed.stderr
 
 
 @pytest.mark.slow
@@ -86,8 +123,9 @@ def test_an_interrupted_training_keeps_its_model_and_goes_on_by_the_printed_comm
     resumed = run("train.py", *words[2:], "--steps", done + 1, folder=tmp_path)
     assert resumed.returncode == 0, resumed.stderr
     assert f"model.zip: the policy after {done + 2048} steps" in resumed.stdout
-    states = sorted(found.info.status for found in client.search_runs(["1"]))
-    assert states == ["FINISHED", "KILLED"]
+    (found,) = client.search_runs(["1"])
+    assert found.info.status == "FINISHED", "the resumed training goes on with the run"
+    assert sampled_steps(client) == done + 2048
 
 
 def sampled_steps(client):
