@@ -22,6 +22,8 @@ from avp_sb3.rerun_room import log_room
 
 _MOST_PICTURES = 400
 _FLUSH_S = 60
+# Of the rollouts' curves in one plot; they can be told apart by the colour-blind too.
+_COLOURS = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (213, 94, 0), (204, 121, 167), (86, 180, 233))
 
 
 def log_rollout(recording: rr.RecordingStream, root: str, contents: RolloutContents) -> None:
@@ -79,12 +81,14 @@ def recording_bytes(
     if destination.own:
         with_map = any(each.map is not None for each in contents)
         blueprint = rollout_blueprint(dict(zip(roots, names, strict=True)), with_map=with_map)
-        recording.send_blueprint(blueprint, make_active=False, make_default=True)
+        # A default that arrives after the first data is too late: the viewer has made up a layout of its own by then.
+        recording.send_blueprint(blueprint, make_active=True, make_default=True)
         recording.send_recording_name(", ".join(names))
-    for root, name, each in zip(roots, names, contents, strict=True):
+    for index, (root, name, each) in enumerate(zip(roots, names, contents, strict=True)):
         log_rollout(recording, root, each)
         if len(roots) > 1:
-            recording.log(f"{root}/plots/coverage", rr.SeriesLines(names=[name]), static=True)
+            curve = rr.SeriesLines(names=[name], colors=[_COLOURS[index % len(_COLOURS)]])
+            recording.log(f"{root}/plots/coverage", curve, static=True)
     written = stream.read(flush=True, flush_timeout_sec=_FLUSH_S)
     if not written:
         raise RolloutError("the recording could not be encoded: expected its bytes, got none")

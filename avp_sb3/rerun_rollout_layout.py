@@ -7,6 +7,7 @@ import rerun.blueprint as rrb
 from avp_sb3.rerun_layout import layout
 
 _STEPS_PER_SECOND = 10.0
+_BACKGROUND = (30, 32, 38)
 
 
 def rollout_blueprint(roots: Mapping[str, str], *, with_map: bool) -> rrb.Blueprint:
@@ -33,7 +34,10 @@ def _side_by_side(roots: Mapping[str, str]) -> rrb.Container:
     """The rooms, below each what its camera sees, below all their coverage in one plot."""
     # The depth picture would be drawn as a second cloud over the room.
     seen = ["$origin/**", "- $origin/camera/depth"]
-    rooms = [rrb.Spatial3DView(origin=f"{root}/world", contents=seen, name=name) for root, name in roots.items()]
+    rooms = [
+        rrb.Spatial3DView(origin=f"{root}/world", contents=seen, name=name, background=_BACKGROUND, line_grid=False)
+        for root, name in roots.items()
+    ]
     cameras = [rrb.Spatial2DView(origin=f"{root}/world/camera/rgb", name=name) for root, name in roots.items()]
     coverage = [f"{root}/plots/coverage" for root in roots]
     return rrb.Vertical(

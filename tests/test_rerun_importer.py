@@ -164,6 +164,13 @@ def test_the_folder_and_its_description_give_the_same_recording(call, rollout, t
     assert len(blueprints(by_file)) == 1
 
 
+def test_the_layout_is_used_at_once(call, rollout):
+    """A default that follows the first data is not: the viewer keeps the layout that it has made up by then."""
+    _, recording, _ = call(rollout)
+    printed = subprocess.run([SCRIPTS / "rerun", "rrd", "print", "-v", recording], capture_output=True, text=True)
+    assert re.search(r"BlueprintActivationCommand\(.*make_active: true, make_default: true\)", printed.stdout)
+
+
 def test_counts_equal_the_rows_of_the_table(call, rollout):
     with (rollout / "steps.csv").open() as file:
         table = list(csv.DictReader(file))

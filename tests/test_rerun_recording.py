@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
-from rrd import entities, rows, verify
+from rrd import chunks, entities, rows, verify
 from small_rollout import ACTIONS, write_small_rollout
 
 from avp_habitat.command import run
@@ -221,6 +221,9 @@ def test_the_command_records_the_rollouts_of_a_folder(rollout, tmp_path, capsys)
     assert run(main, [str(tmp_path / "all"), "--out", str(target)]) == 0
     assert re.search(r"both\.rrd: 2 rollouts, \d+\.\d MB", capsys.readouterr().out)
     assert {entity.split("/")[1] for entity in entities(target)} == {"a", "b"}
+    drawn = {chunk.entity_path: chunk.to_record_batch() for chunk in chunks(target) if chunk.is_static}
+    colours = [drawn[f"/{name}/plots/coverage"].column("SeriesLines:colors").to_pylist() for name in ("a", "b")]
+    assert colours[0] != colours[1]
     assert run(main, [str(rollout), "--out", str(target)]) == 2
     assert "--out " in capsys.readouterr().err
 
