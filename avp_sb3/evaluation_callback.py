@@ -21,6 +21,7 @@ from avp_sb3.own_dump import logged_alone, move_to_front
 from avp_sb3.random_state import own_random_state
 
 DEFAULT_SCENES = ("builtin:7",)
+DEFAULT_EVERY, DEFAULT_EPISODES = 100_000, 10
 _SCREEN = ("stdout", "log")
 _NO_PICTURES = (*_SCREEN, "json", "csv")
 _LONGEST_SCENE = 18
@@ -51,8 +52,8 @@ class EvaluationCallback(BaseCallback):
         scenes: str | Sequence[str] | None = None,
         *,
         eval_env: VecEnv | None = None,
-        every: int = 100_000,
-        episodes: int = 10,
+        every: int = DEFAULT_EVERY,
+        episodes: int = DEFAULT_EPISODES,
         seed: int = 1000,
         deterministic: bool = False,
         score: str = "return",
