@@ -1,8 +1,9 @@
 """What a Rerun recording shows of an episode: the entity paths, the time lines and what is logged there.
 
-Under the root of an episode, `world` holds the scene (right-handed, Y up, metres) with `floor` (navigable cells,
-coloured when observed), `path`, `views` (wire pyramids of all viewpoints), `agent` (the sensor at each step) and
-`camera` (the pictured views, with `rgb` and `depth` below it); `plots` holds the figures of each step.
+Under the root of an episode, `world` holds the scene (right-handed, Y up, metres) with `room` (a coloured cloud),
+`floor` (navigable cells, coloured when observed), `path`, `views` (wire pyramids of all viewpoints), `agent` (the
+sensor at each step) and `camera` (the pictured views, with `rgb` and `depth` below it); `plots` holds the figures of
+each step.
 
 Time lines: `step` counts the recorded steps, one episode after the other, so that nothing overlaps; `episode` is the
 episode's number; `env_step` is how many environment steps the training had done when the episode ended (MLflow's
@@ -11,7 +12,7 @@ x axis).
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,9 +28,20 @@ if TYPE_CHECKING:
     from avp_habitat.navigation.area import NavigableArea
     from avp_habitat.trajectory import Trajectory
 
-UNSEEN, SEEN = 0, 1
-_FLOOR_CLASSES = [(UNSEEN, "navigable", (205, 208, 214)), (SEEN, "observed", (53, 183, 121))]
+_UNSEEN_COLOUR, _SEEN_COLOUR = 0xAEB4C0FF, 0x35B779FF
 _PATH_COLOUR, _VIEW_COLOUR, _AGENT_COLOUR = (178, 34, 52), (228, 120, 51, 120), (40, 40, 44)
+_PLOT_COLOURS = (
+    0x35B779FF,
+    0x8C7AE6FF,
+    0x95A5A6FF,
+    0xE15759FF,
+    0x4E79A7FF,
+    0xF28E2BFF,
+    0x76B7B2FF,
+    0xEDC948FF,
+    0xB07AA1FF,
+)
+_CELL_CHANGES = 200_000
 _PYRAMID_M = 0.15
 _JPEG_QUALITY = 80
 
@@ -67,29 +79,32 @@ class Episode:
 
 
 def episode_of(
-    trajectory: "Trajectory", area: "NavigableArea", intrinsics: Intrinsics, views: Mapping[int, EncodedView]
+    trajectory: "Trajectory",
+    area: "NavigableArea | None",
+    intrinsics: Intrinsics,
+    views: Mapping[int, EncodedView],
 ) -> Episode:
-    """The episode of an environment.
+    """The episode of an environment; without its area no floor is shown.
 
     Raises:
         UsageError: the trajectory belongs to another scene than the area.
     """
-    if len(trajectory.first_seen) != len(area.centres):
+    if area is not None and len(trajectory.first_seen) != len(area.centres):
         raise UsageError(
             f"the trajectory knows {len(trajectory.first_seen)} navigable cells, the environment's area "
             f"{len(area.centres)}: they belong to different scenes"
         )
     parts = {f"reward/{name}": values for name, values in trajectory.reward_parts.items()}
-    return Episode(
+    episode = Episode(
         camera_to_world=trajectory.camera_to_world,
         path=np.concatenate([trajectory.start[None], trajectory.position]),
         intrinsics=intrinsics,
         views=views,
         plots={"coverage": trajectory.coverage, "action": trajectory.action, "reward/sum": trajectory.reward, **parts},
-        cells=np.asarray(area.centres),
-        first_seen=trajectory.first_seen,
-        cell_m=area.cell_m,
     )
+    if area is None:
+        return episode
+    return replace(episode, cells=np.asarray(area.centres), first_seen=trajectory.first_seen, cell_m=area.cell_m)
 
 
 def encode_view(rgb: NDArray[np.uint8], depth: NDArray[np.floating]) -> EncodedView:
@@ -112,7 +127,14 @@ def spread_indices(count: int, at_most: int) -> list[int]:
 
 
 def log_episode(
-    recording: rr.RecordingStream, root: str, episode: Episode, *, number: int, first_step: int = 0, env_step: int = 0
+    recording: rr.RecordingStream,
+    root: str,
+    episode: Episode,
+    *,
+    number: int,
+    first_step: int = 0,
+    env_step: int = 0,
+    with_scene: bool = True,
 ) -> None:
     """Add an episode to a recording.
 
@@ -123,25 +145,26 @@ def log_episode(
         number: of the episode (time line `episode`).
         first_step: value of the time line `step` at the episode's first step.
         env_step: value of the time line `env_step`.
+        with_scene: also add what holds at all times (axes, cells, camera, looks); once per root is enough.
     """
     steps = len(episode.camera_to_world)
     if not steps:
         return
     clock = _Clock(number, first_step, env_step)
-    clock.set(recording, 0)
+    if with_scene:
+        _log_scene(recording, root, episode)
+    clock.set(recording)
     world = f"{root}/world"
-    recording.log(world, rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
     recording.log(f"{world}/path", rr.LineStrips3D([_lifted(episode.path)], colors=[_PATH_COLOUR], radii=[0.015]))
     recording.log(f"{world}/views", rr.LineStrips3D(_pyramids(episode), colors=[_VIEW_COLOUR], radii=[0.003]))
-    _log_floor(recording, f"{world}/floor", episode, clock)
-    _log_agent(recording, f"{world}/agent", episode, clock)
+    recording.reset_time()
+    _send_floor(recording, f"{world}/floor", episode, clock)
+    recording.send_columns(f"{world}/agent", clock.columns(range(steps)), _transforms(episode.camera_to_world))
     for name, values in episode.plots.items():
         columns = rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64))
         recording.send_columns(f"{root}/plots/{name}", clock.columns(range(steps)), columns)
-    for step, view in sorted(episode.views.items()):
-        clock.set(recording, step)
-        _log_view(recording, f"{world}/camera", view, episode.camera_to_world[step], episode.intrinsics)
-    recording.reset_time()
+    if episode.views:
+        _send_views(recording, f"{world}/camera", episode, clock)
 
 
 @dataclass(frozen=True)
@@ -152,8 +175,8 @@ class _Clock:
     first_step: int
     env_step: int
 
-    def set(self, recording: rr.RecordingStream, step: int) -> None:
-        recording.set_time("step", sequence=self.first_step + step)
+    def set(self, recording: rr.RecordingStream) -> None:
+        recording.set_time("step", sequence=self.first_step)
         recording.set_time("episode", sequence=self.number)
         recording.set_time("env_step", sequence=self.env_step)
 
@@ -166,34 +189,55 @@ class _Clock:
         ]
 
 
-def _log_floor(recording: rr.RecordingStream, path: str, episode: Episode, clock: _Clock) -> None:
-    """The cells once, their classes again at each step that observed new ones."""
+def _log_scene(recording: rr.RecordingStream, root: str, episode: Episode) -> None:
+    """What holds at all times."""
+    world = f"{root}/world"
+    recording.log(world, rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
+    recording.log(f"{world}/agent", _pinhole(episode.intrinsics, colour=_AGENT_COLOUR), static=True)
+    if episode.views:
+        recording.log(f"{world}/camera", _pinhole(episode.intrinsics), static=True)
+    if len(episode.cells):
+        cells = rr.Points3D(episode.cells, radii=[0.45 * episode.cell_m])
+        recording.log(f"{world}/floor", cells, static=True)
+    for index, name in enumerate(episode.plots):
+        colour = _PLOT_COLOURS[index % len(_PLOT_COLOURS)]
+        dots = rr.SeriesPoints(colors=[colour], marker_sizes=[2])
+        looks = dots if name == "action" else rr.SeriesLines(colors=[colour])
+        recording.log(f"{root}/plots/{name}", looks, static=True)
+
+
+def _send_floor(recording: rr.RecordingStream, path: str, episode: Episode, clock: _Clock) -> None:
+    """The colours of the cells, again at each step that observed new ones; at fewer steps on large floors."""
     cells = len(episode.cells)
     if not cells:
         return
-    recording.log(path, rr.AnnotationContext(_FLOOR_CLASSES), static=True)
-    recording.log(path, rr.Points3D(episode.cells, radii=[0.45 * episode.cell_m]))
     seen = np.asarray(episode.first_seen)
     changes = [0, *sorted({int(step) - 1 for step in seen[seen > 0]} - {0})]
-    classes = np.stack([(seen > 0) & (seen <= step + 1) for step in changes]).astype(np.uint16)
-    columns = rr.Points3D.columns(class_ids=classes.ravel()).partition([cells] * len(changes))
+    changes = [changes[index] for index in spread_indices(len(changes), max(2, _CELL_CHANGES // cells))]
+    observed = np.stack([(seen > 0) & (seen <= step + 1) for step in changes])
+    colours = np.where(observed, np.uint32(_SEEN_COLOUR), np.uint32(_UNSEEN_COLOUR))
+    columns = rr.Points3D.columns(colors=colours.ravel()).partition([cells] * len(changes))
     recording.send_columns(path, clock.columns(changes), columns)
 
 
-def _log_agent(recording: rr.RecordingStream, path: str, episode: Episode, clock: _Clock) -> None:
-    recording.log(path, _pinhole(episode.intrinsics, colour=_AGENT_COLOUR))
-    poses = episode.camera_to_world
-    columns = rr.Transform3D.columns(translation=poses[:, :3, 3], mat3x3=poses[:, :3, :3])
-    recording.send_columns(path, clock.columns(range(len(poses))), columns)
+def _send_views(recording: rr.RecordingStream, path: str, episode: Episode, clock: _Clock) -> None:
+    """The pictures, and where their camera stood."""
+    steps = sorted(episode.views)
+    times, views = clock.columns(steps), [episode.views[step] for step in steps]
+    recording.send_columns(path, times, _transforms(episode.camera_to_world[steps]))
+    colour = rr.EncodedImage.columns(blob=[view.rgb for view in views], media_type=["image/jpeg"] * len(views))
+    recording.send_columns(f"{path}/rgb", times, colour)
+    depth = rr.EncodedDepthImage.columns(
+        blob=[view.depth for view in views],
+        media_type=["image/png"] * len(views),
+        meter=[1 / images.DEPTH_UNIT_M] * len(views),
+    )
+    recording.send_columns(f"{path}/depth", times, depth)
 
 
-def _log_view(
-    recording: rr.RecordingStream, path: str, view: EncodedView, pose: NDArray[np.floating], intrinsics: Intrinsics
-) -> None:
-    recording.log(path, rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]), _pinhole(intrinsics))
-    recording.log(f"{path}/rgb", rr.EncodedImage(contents=view.rgb, media_type="image/jpeg"))
-    depth = rr.EncodedDepthImage(view.depth, media_type="image/png", meter=1 / images.DEPTH_UNIT_M)
-    recording.log(f"{path}/depth", depth)
+def _transforms(poses: NDArray[np.floating]) -> rr.ComponentColumnList:
+    """`(n, 4, 4)` poses, one per time."""
+    return rr.Transform3D.columns(translation=poses[:, :3, 3], mat3x3=poses[:, :3, :3])
 
 
 def _pinhole(intrinsics: Intrinsics, colour: tuple[int, int, int] | None = None) -> rr.Pinhole:

@@ -3,8 +3,10 @@ import io
 import gymnasium
 import numpy as np
 import pytest
+from corridor import ROOM, WALL
 from PIL import Image
-from rrd import entities, rows, verify
+from rerun.chunk import RrdReader
+from rrd import chunks, entities, rows, verify
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 from tracking import SmallEnv, ppo
@@ -23,13 +25,25 @@ class Notes(BaseCallback):
 
     def __init__(self):
         super().__init__()
-        self.trajectories, self.env_steps = [], []
+        self.trajectories, self.episodes, self.env_steps = [], [], []
 
     def _on_step(self):
         ended = [info["avp_trajectory"] for info in self.locals["infos"] if "avp_trajectory" in info]
         self.trajectories += ended
+        self.episodes += [info["avp_episode"] for info in self.locals["infos"] if "avp_episode" in info]
         self.env_steps += [self.num_timesteps] * len(ended)
         return True
+
+
+def static(path, entity, component):
+    """The only value that an entity has at all times."""
+    found = []
+    for chunk in chunks(path):
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == entity and component in batch.schema.names and "step" not in batch.schema.names:
+            found += batch.column(component).to_pylist()
+    assert len(found) == 1
+    return np.array(found[0])
 
 
 @pytest.fixture(scope="module")
@@ -47,10 +61,12 @@ def test_recording_passes_reruns_own_check(recorded):
 
 
 def test_recording_has_the_entities_of_the_layout(recorded):
-    parts = {"coverage", "spread", "step", "collision", "redundancy", "stop", "sum"}
-    world = {"floor", "path", "views", "agent", "camera", "camera/rgb", "camera/depth"}
-    expected = {"/world", "/plots/coverage", "/plots/action"}
+    parts = {"coverage", "spread", "step", "collision", "redundancy", "stop"}
+    world = {"room", "floor", "path", "views", "agent", "camera", "camera/rgb", "camera/depth"}
+    expected = {"/world", "/plots/coverage", "/plots/action", "/plots/reward/sum"}
     expected |= {f"/world/{name}" for name in world} | {f"/plots/reward/{name}" for name in parts}
+    figures = {"coverage", "views", "annd_m", "ei", "path_length_m", "collisions", "redundant_views", "stopped"}
+    expected |= {f"/metrics/{name}" for name in figures} | {f"/metrics/return/{name}" for name in parts}
     assert entities(recorded[0]) == expected
 
 
@@ -90,23 +106,51 @@ def test_camera_and_agent_stand_where_the_views_were_taken(recorded):
 def test_pinhole_has_the_pictures_size_and_habitats_axes(recorded):
     path, _ = recorded
     for entity in ("/world/agent", "/world/camera"):
-        np.testing.assert_allclose(rows(path, entity, "Pinhole:resolution")[0][1], [32, 20])
-        matrix = rows(path, entity, "Pinhole:image_from_camera")[0][1].reshape(3, 3).T
+        np.testing.assert_allclose(static(path, entity, "Pinhole:resolution").ravel(), [32, 20])
+        matrix = static(path, entity, "Pinhole:image_from_camera").reshape(3, 3).T
         np.testing.assert_allclose(matrix, Intrinsics.from_hfov(32, 20, hfov_deg=90).matrix)
         right, up, back = 3, 1, 6
-        assert rows(path, entity, "Pinhole:camera_xyz")[0][1].tolist() == [right, up, back]
+        assert static(path, entity, "Pinhole:camera_xyz").ravel().tolist() == [right, up, back]
+
+
+def test_the_world_is_right_handed_with_y_up(recorded):
+    right, up, back = 3, 1, 6
+    assert static(recorded[0], "/world", "ViewCoordinates:xyz").ravel().tolist() == [right, up, back]
 
 
 def test_floor_changes_with_what_was_seen(recorded):
     path, notes = recorded
-    found = rows(path, "/world/floor", "Points3D:class_ids")
+    found = rows(path, "/world/floor", "Points3D:colors")
     first = notes.trajectories[0]
-    mine = [(time, classes) for time, classes in found if time < len(first.action)]
+    mine = [(time, colours == 0x35B779FF) for time, colours in found if time < len(first.action)]
     assert mine[0][0] == 0
-    for time, classes in mine:
-        assert classes.mean() == pytest.approx(first.coverage[time])
+    for time, observed in mine:
+        assert observed.mean() == pytest.approx(first.coverage[time])
     assert mine[-1][1].tolist() == (first.first_seen > 0).tolist()
-    assert len(rows(path, "/world/floor", "Points3D:positions")[0][1]) == 3 * len(first.first_seen)
+    np.testing.assert_allclose(static(path, "/world/floor", "Points3D:positions"), SmallEnv().area.centres, atol=1e-6)
+
+
+def test_the_room_lies_on_the_corridors_walls_and_floor(recorded):
+    points = static(recorded[0], "/world/room", "Points3D:positions")
+    assert len(points) > 1000
+    faces = np.abs(np.concatenate([points[..., None] - ROOM.T, points[..., None] - WALL.T], axis=-1))
+    assert np.quantile(faces.min(axis=(1, 2)), 0.99) < 0.05
+    # Both sides of the dividing wall and its whole length are there, the ceiling is not.
+    assert np.ptp(points, axis=0) == pytest.approx([6, 1.8, 3], abs=0.15)
+
+
+def test_figures_of_every_episode_are_curves(recorded):
+    path, notes = recorded
+    for name, key in (("coverage", "coverage"), ("views", "views"), ("return/spread", "return_spread")):
+        found = rows(path, f"/metrics/{name}", "Scalars:scalars", "episode")
+        assert [time for time, _ in found] == list(range(1, len(notes.episodes) + 1))
+        np.testing.assert_allclose([value[0] for _, value in found], [episode[key] for episode in notes.episodes])
+    env_steps = [time for time, _ in rows(path, "/metrics/coverage", "Scalars:scalars", "env_step")]
+    assert env_steps == notes.env_steps
+    # On the time line of the recorded steps stand the recorded episodes, at their last view.
+    ends = np.cumsum([len(trajectory.action) for trajectory in notes.trajectories[::3]]) - 1
+    found = rows(path, "/metrics/coverage", "Scalars:scalars", "step")
+    assert [time for time, _ in found if time is not None] == ends.tolist()
 
 
 def test_pictures_are_what_the_simulator_renders_at_those_poses(recorded):
@@ -117,6 +161,7 @@ def test_pictures_are_what_the_simulator_renders_at_those_poses(recorded):
     steps = spread_indices(len(first.action), 4)
     assert [time for time, _ in colour] == [time for time, _ in depth] == steps
     frames = SmallEnv().capture(first.camera_to_world[steps], Intrinsics.from_hfov(32, 20, hfov_deg=90))
+    assert frames.rgb is not None
     for index in range(len(steps)):
         rgb = np.asarray(Image.open(io.BytesIO(colour[index][1].astype(np.uint8).tobytes())))
         assert rgb.shape == (20, 32, 3)
@@ -125,11 +170,21 @@ def test_pictures_are_what_the_simulator_renders_at_those_poses(recorded):
         np.testing.assert_allclose(metres, frames.depth[index], atol=DEPTH_UNIT_M)
 
 
-def test_a_full_file_takes_no_further_episode(tmp_path):
+def test_a_file_stays_within_its_size_and_says_so_once(tmp_path, capsys):
+    path, bound = tmp_path / "small.rrd", 250_000
+    ppo().learn(256, callback=RerunCallback(path, every=1, max_share=1, width=32, height=20, max_bytes=bound))
+    verify(path)
+    assert 1 < len({time for time, _ in rows(path, "/plots/coverage", "Scalars:scalars", "episode")}) < 32
+    assert 0.5 * bound < path.stat().st_size <= 1.25 * bound
+    said = capsys.readouterr().err
+    assert said.count(f"small.rrd: has reached max_bytes ({bound}); nothing further is recorded") == 1
+
+
+def test_a_file_without_room_takes_no_episode(tmp_path):
     path = tmp_path / "small.rrd"
     ppo().learn(64, callback=RerunCallback(path, every=1, max_share=1, pictures=0, max_bytes=1))
     verify(path)
-    assert not rows(path, "/plots/coverage", "Scalars:scalars")
+    assert entities(path) == set()
 
 
 def test_a_second_training_writes_a_second_file(tmp_path):
@@ -139,6 +194,9 @@ def test_a_second_training_writes_a_second_file(tmp_path):
     assert callback.path == tmp_path / "a-2.rrd"
     for name in ("a.rrd", "a-2.rrd"):
         assert rows(tmp_path / name, "/plots/coverage", "Scalars:scalars")
+    # With equal ids, a viewer that opens both would show them as one.
+    ids = {RrdReader(tmp_path / name).recordings()[0].recording_id for name in ("a.rrd", "a-2.rrd")}
+    assert len(ids) == 2
 
 
 def test_an_existing_file_is_refused(tmp_path):
