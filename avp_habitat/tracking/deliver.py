@@ -13,6 +13,9 @@ from avp_habitat.tracking.addresses import TrackingError, absolute, shown
 from avp_habitat.tracking.journal import SPOOL_VARIABLE, Journal, spool_folder
 from avp_habitat.tracking.recovery import Recovered, finish, left_journals
 
+# Somebody waits for this, and a server that has just been started takes long over its first answers.
+_PATIENCE_S = 120.0
+
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
@@ -59,7 +62,7 @@ def _deliver(spool: Path, count: int, *, address: str | None, again: bool) -> li
         for journal in left_journals(spool):
             if address is not None:
                 journal.header["address"] = absolute(address)
-            done.append(finish(journal, again=again))
+            done.append(finish(journal, again=again, timeout_s=_PATIENCE_S))
             progress.update()
     return done
 

@@ -8,7 +8,6 @@ import json
 import math
 import shutil
 from collections.abc import Callable, Iterable, Sequence
-from itertools import groupby
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
@@ -46,6 +45,8 @@ class Delivery:
         self._run_id = run_id
         self._folder = folder
         self._reject = reject
+        self.calls = 0
+        """How many calls MLflow has answered."""
 
     def send(self, entries: Sequence[dict[str, Any]], *, uncertain: bool) -> None:
         """Tell MLflow.
@@ -57,12 +58,12 @@ class Delivery:
         Raises:
             Exception: MLflow cannot be reached, or fails for another reason that may pass.
         """
-        for kind, group in groupby(entries, key=_kind):
-            if kind == "values":
-                self._send_values(list(group), uncertain=uncertain)
-            else:
-                for entry in group:
-                    self._unless_refused([entry], lambda entry=entry: self._send_one(entry))
+        self._send_values([entry for entry in entries if _is_values(entry)], uncertain=uncertain)
+        # Of files that replace each other the last one is enough. A run ends after everything else.
+        files = {entry["path"]: entry for entry in entries if "file" in entry}
+        others = [entry for entry in entries if not _is_values(entry) and "file" not in entry]
+        for entry in [*files.values(), *others]:
+            self._unless_refused([entry], lambda entry=entry: self._send_one(entry))
 
     def _send_values(self, entries: list[dict[str, Any]], *, uncertain: bool) -> None:
         from mlflow.entities import Metric, Param, RunTag
@@ -138,6 +139,7 @@ class Delivery:
         known: set[tuple[Any, ...]] = set()
         for key in {point.key for point in points}:
             known |= {_identity(point) for point in self._client.get_metric_history(self._run_id, key)}
+            self.calls += 1
         missing = []
         for point in points:
             if _identity(point) not in known:
@@ -155,10 +157,11 @@ class Delivery:
                 raise
             for entry in entries:
                 self._reject(entry, first_line(error))
+        self.calls += 1
 
 
-def _kind(entry: dict[str, Any]) -> str:
-    return "values" if entry.keys() & {"metrics", "tags", "params"} else "other"
+def _is_values(entry: dict[str, Any]) -> bool:
+    return bool(entry.keys() & {"metrics", "tags", "params"})
 
 
 def _chunks(items: list[Any], size: int) -> Iterable[list[Any]]:

@@ -239,11 +239,6 @@ class Journal:
             self._temporary.cleanup()
             self._temporary = None
 
-    @property
-    def pending_bytes(self) -> int:
-        """How much was not acknowledged, entries that wait in memory counted as one byte each."""
-        return self._size - self._sent + len(self._waiting)
-
     def __bool__(self) -> bool:
         """Whether something was not acknowledged."""
         return self._sent < self._size or bool(self._waiting)

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal
 from uuid import uuid4
 
-from avp_habitat.tracking.addresses import TrackingError, connect, is_missing, shown
+from avp_habitat.tracking.addresses import StoreUnreachableError, connect, is_missing, shown
 from avp_habitat.tracking.delivery import Delivery
 from avp_habitat.tracking.journal import Journal
 from avp_habitat.tracking.names import Names, safe_name
@@ -163,8 +163,7 @@ class TrackedRun:
     def leave(self, *, timeout_s: float = _CLOSING_S) -> bool:
         """Send the rest without ending the run; whether MLflow has everything."""
         try:
-            # A server that is known to be gone is not waited for.
-            self._sender.drain(timeout_s if self._sender.problem is None else 2.0)
+            self._sender.drain(timeout_s)
         finally:
             # A thread that hangs in a call keeps the journal until this process ends.
             self._put_away(idle=self._sender.stop())
@@ -196,7 +195,7 @@ class TrackedRun:
         header = self._journal.header
         if self._client is None:
             if header["run_id"] is not None and is_missing(self.address):
-                raise TrackingError("the database is gone")
+                raise StoreUnreachableError("the database is gone")
             self._client = connect(self.address)
         if header["run_id"] is None:
             header["run_id"] = create(self._client, header)

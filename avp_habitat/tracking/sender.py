@@ -5,13 +5,14 @@ import threading
 import time
 from collections.abc import Callable
 
-from avp_habitat.tracking.addresses import first_line, shown, unreachable
+from avp_habitat.tracking.addresses import StoreUnreachableError, first_line, shown, unreachable
 from avp_habitat.tracking.delivery import Delivery
 from avp_habitat.tracking.journal import Journal
 
 INTERVAL_S = 5.0
 """Time between two calls while a run lasts; each costs the training tens of milliseconds of Python."""
 _RETRY_S = (1.0, 15.0)
+_ASKED_AGAIN = 2
 _log = logging.getLogger(__name__)
 
 
@@ -45,6 +46,7 @@ class Sender:
         self._hurry = threading.Event()
         self._stopped = threading.Event()
         self._idle = threading.Event()
+        self._unanswered = 0
         self.problem: str | None = None
         """Why nothing arrives just now."""
         self._thread: threading.Thread | None = None
@@ -59,7 +61,7 @@ class Sender:
         """Send everything without waiting for the interval; whether MLflow has it.
 
         Args:
-            timeout_s: to wait at most without any progress; a store that does not answer is asked once more.
+            timeout_s: to wait at most without any progress; a server that is gone is asked twice more instead.
         """
         if self._thread is None:
             return not self._journal
@@ -80,14 +82,19 @@ class Sender:
 
     def _wait_while_it_moves(self, timeout_s: float) -> bool:
         until = time.monotonic() + timeout_s
-        left = self._journal.pending_bytes
+        calls, asked = self._calls, self._unanswered
         while not self._journal.wait(0.2, for_entries=False):
-            if self._journal.pending_bytes < left:
-                left = self._journal.pending_bytes
+            if self._calls > calls:
+                calls = self._calls
                 until = time.monotonic() + timeout_s
-            if time.monotonic() > until or not (self._thread and self._thread.is_alive()):
+            gone = self._unanswered - asked >= _ASKED_AGAIN
+            if gone or time.monotonic() > until or not (self._thread and self._thread.is_alive()):
                 return False
         return True
+
+    @property
+    def _calls(self) -> int:
+        return 0 if self._delivery is None else self._delivery.calls
 
     def _work(self) -> None:
         pause = _RETRY_S[0]
@@ -98,6 +105,7 @@ class Sender:
                 self._send_some()
             except Exception as error:
                 self._uncertain = True
+                self._unanswered += isinstance(error, StoreUnreachableError)
                 self._failed(first_line(error))
                 self._rest(pause)
                 pause = min(2 * pause, _RETRY_S[1])
@@ -115,7 +123,7 @@ class Sender:
 
     def _send_some(self) -> None:
         if (problem := unreachable(self._address)) is not None:
-            raise ConnectionError(problem)
+            raise StoreUnreachableError(problem)
         if self._delivery is None:
             self._delivery = self._open_delivery()
         batch = self._journal.read()

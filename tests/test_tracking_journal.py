@@ -1,0 +1,163 @@
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from avp_habitat.tracking import journal as module
+from avp_habitat.tracking.journal import VERSION, Journal
+
+HEADER = {
+    "version": VERSION,
+    "key": "k1",
+    "address": "sqlite:///x.db",
+    "run_id": None,
+    "owned": True,
+    "ended": None,
+    "started_ms": 1,
+}
+
+
+@pytest.fixture
+def journal(tmp_path):
+    made = Journal.create(tmp_path, HEADER)
+    yield made
+    made.release()
+
+
+def drained(journal):
+    entries = []
+    while (batch := journal.read()) is not None:
+        entries += batch.entries
+        journal.acknowledge(batch)
+    return entries
+
+
+def test_entries_come_back_in_order_and_once(journal):
+    entries = [{"metrics": [["a", i, 0, i]]} for i in range(5)]
+    for entry in entries[:3]:
+        journal.append(entry)
+    assert drained(journal) == entries[:3]
+    for entry in entries[3:]:
+        journal.append(entry)
+    assert drained(journal) == entries[3:]
+    assert journal.read() is None
+    assert not journal
+
+
+def test_what_was_not_acknowledged_comes_again_also_to_the_next_process(tmp_path):
+    first = Journal.create(tmp_path, HEADER)
+    for i in range(3):
+        first.append({"tags": {"n": str(i)}})
+    first.acknowledge(first.read())
+    first.append({"tags": {"n": "3"}})
+    assert first.read().entries == first.read().entries == [{"tags": {"n": "3"}}]
+    first.release()
+    second = Journal.adopt(tmp_path / "k1")
+    assert second.header == HEADER
+    assert drained(second) == [{"tags": {"n": "3"}}]
+    second.remove()
+    assert not (tmp_path / "k1").exists()
+
+
+def test_a_line_cut_off_by_a_power_cut_is_dropped_and_one_that_is_damaged_is_named(tmp_path):
+    first = Journal.create(tmp_path, HEADER)
+    first.append({"tags": {"n": "0"}})
+    first.release()
+    file = tmp_path / "k1" / "journal.jsonl"
+    file.write_bytes(file.read_bytes() + b'\xff{"tags"\n' + b'{"tags": {"n": "lo')
+    second = Journal.adopt(tmp_path / "k1")
+    second.append({"tags": {"n": "1"}})
+    assert [entry.get("tags") for entry in drained(second)] == [{"n": "0"}, None, {"n": "1"}]
+    second.release()
+
+
+def test_a_long_journal_is_read_in_parts_and_gives_its_space_back(journal, monkeypatch):
+    monkeypatch.setattr(module, "_CHUNK", 1000)
+    monkeypatch.setattr(module, "_COMPACT", 2000)
+    entries = [{"tags": {"text": "x" * (700 * (i % 4) + 1), "n": str(i)}} for i in range(20)]
+    for entry in entries:
+        journal.append(entry)
+    assert len(journal.read().entries) < 20
+    assert drained(journal) == entries
+    assert (journal.folder / "journal.jsonl").stat().st_size == 0
+    journal.append({"tags": {"n": "after"}})
+    assert drained(journal) == [{"tags": {"n": "after"}}]
+
+
+def test_a_journal_in_use_is_nobody_elses(journal, tmp_path):
+    assert Journal.adopt(tmp_path / "k1") is None
+    code = f"""
+import sys
+from pathlib import Path
+from avp_habitat.tracking.journal import Journal
+sys.exit(Journal.adopt(Path({str(tmp_path / "k1")!r})) is not None)
+"""
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+    # Looking at it must not have opened the lock for others.
+    assert Journal.in_use(tmp_path / "k1")
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_a_folder_that_is_no_journal_is_left_alone(tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "run.json").write_text(json.dumps(HEADER | {"version": 0}))
+    assert Journal.adopt(tmp_path / "photos") is None
+    assert Journal.adopt(tmp_path / "old") is None
+    assert list((tmp_path / "photos").iterdir()) == []
+
+
+def test_a_disk_that_takes_nothing_leaves_memory(tmp_path):
+    (tmp_path / "file").touch()
+    journal = Journal.create(tmp_path / "file", HEADER)
+    assert "Not a directory" in journal.problem
+    journal.append({"tags": {"n": "0"}})
+    batch = journal.read()
+    # Comes while the batch is on its way.
+    journal.append({"tags": {"n": "1"}})
+    journal.acknowledge(batch)
+    with journal.new_file("a.bin") as path:
+        path.write_bytes(b"1")
+    assert path.read_bytes() == b"1"
+    assert drained(journal) == [{"tags": {"n": "1"}}]
+    journal.release()
+    assert not path.exists()
+
+
+# A limit on the size of files, which stands for a full disk, holds for a whole process.
+FULL = """
+import resource, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from test_tracking_journal import HEADER, drained
+from avp_habitat.tracking.journal import Journal
+
+journal = Journal.create(Path(sys.argv[1]), HEADER)
+soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+entries = [{"tags": {"n": str(i), "text": "x" * 200}} for i in range(30)]
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+for entry in entries[:20]:
+    journal.append(entry)
+assert "k1: " in journal.problem, journal.problem
+first = journal.read()
+journal.acknowledge(first)
+on_the_way = journal.read()
+resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+for entry in entries[20:]:
+    journal.append(entry)
+journal.acknowledge(on_the_way)
+rest = drained(journal)
+assert first.entries + on_the_way.entries + rest == entries
+assert len(first.entries) in (3, 4) and rest == entries[20:], (len(first.entries), len(rest))
+assert journal.problem is None
+"""
+
+
+def test_a_full_disk_costs_nothing_while_the_process_lives(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, tmp_path, Path(__file__).parent], capture_output=True, text=True, cwd=os.getcwd()
+    )
+    assert done.returncode == 0, done.stderr
