@@ -145,24 +145,29 @@ def _alone(address: str) -> Iterator[None]:
 
 
 def experiment_id(client: "MlflowClient", name: str) -> tuple[str, bool]:
-    """The id of an experiment, which is made when it does not exist, and whether it was made now.
+    """The id of an experiment, which is made, with its views, when it does not exist; whether it was made now.
 
     Raises:
         MlflowException: the store refuses.
     """
     from mlflow.exceptions import MlflowException
 
+    from avp_habitat.tracking.view import prepare_experiment
+
     for attempt in range(_ATTEMPTS):
         found = client.get_experiment_by_name(name)
         if found is not None:
             return found.experiment_id, False
         try:
-            return client.create_experiment(name), True
+            identity = client.create_experiment(name)
         except MlflowException:
             # Another process may have been faster.
             if attempt == _ATTEMPTS - 1:
                 raise
             time.sleep(0.1)
+        else:
+            prepare_experiment(client, identity)
+            return identity, True
     raise AssertionError
 
 
