@@ -122,12 +122,13 @@ def test_the_room_lies_on_the_surfaces_that_the_depth_files_show(recorded):
 
 def test_large_pictures_are_subsampled_with_their_camera(tmp_path):
     big = write_small_rollout(tmp_path / "big", ACTIONS[:2], width=1282, height=26)
+    stored = (np.arange(26 * 1282, dtype=np.uint16) + 500).reshape(26, 1282)
+    Image.fromarray(stored).save(big / "depth" / "frame_00000.png")
     episode = read_contents(read_rollout(big)).episode
     camera, view = episode.intrinsics, episode.views[0]
     assert (camera.width, camera.height, camera.cx) == (427, 8, pytest.approx(1282 / 2 / 3))
     rgb, depth = Image.open(io.BytesIO(view.rgb)), np.asarray(Image.open(io.BytesIO(view.depth)))
     assert rgb.size == depth.shape[::-1] == (427, 8)
-    stored = np.asarray(Image.open(big / "depth" / "frame_00000.png"))
     np.testing.assert_array_equal(depth, stored[1:24:3, 1:1281:3])
 
 
