@@ -45,7 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--reward", default="proposed", help="the reward's name")
     add("--agents", default=TABLE_4.n_envs, type=int, help="stepped as one batch; divides PPO's buffer of 2048 steps")
     add("--repeats", default=5, type=int, help="repetitions")
-    add("--steps", default=200_704, type=int, help="of each training; two evaluations at their default distance")
+    add("--steps", default=300_000, type=int, help="of each training; two evaluations at their default distance")
     add("--delay-steps", default=61_440, type=int, help="of the training during which MLflow is polled")
     add("--episodes", default=50, type=int, help="recorded to find their size")
     add("--seed", default=0, type=int, help="of the first repetition; repetition i uses SEED + i")

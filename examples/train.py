@@ -37,7 +37,7 @@ def _parser() -> argparse.ArgumentParser:
         help="go on until --steps are done with a model: a file, or MLflow's runs:/RUN_ID/model.zip",
     )
     add("--eval-scene", default=None, nargs="+", metavar="SCENE", help="evaluate in these too, and keep the best model")
-    add("--eval-every", default=100_000, type=int, help="environment steps between two evaluations")
+    add("--eval-every", default=150_000, type=int, help="environment steps between two evaluations")
     add("--recording", default=None, type=Path, help="the Rerun recording (.rrd) of some episodes; none when omitted")
     add("--experiment", default="avp", help="of MLflow")
     add("--run-name", default=None, help="of the MLflow run")

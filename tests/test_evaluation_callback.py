@@ -1,3 +1,4 @@
+import csv
 import json
 import random
 import signal
@@ -14,9 +15,10 @@ import numpy as np
 import pytest
 import torch
 from corridor import Corridor
+from mlflow import MlflowClient
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Image, KVWriter, Logger
+from stable_baselines3.common.logger import Image, KVWriter, Logger, configure
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
@@ -25,13 +27,14 @@ from stable_baselines3.common.vec_env import (
     VecMonitor,
     VecNormalize,
 )
-from tracking import SETTINGS, SmallEnv, ppo
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tracking import SETTINGS, SmallEnv, mlflow_home, ppo
 
 from avp_habitat.drawing import draw_trajectory
 from avp_habitat.env import AVPEnv
 from avp_habitat.errors import SceneError, UsageError
 from avp_habitat.settings import TaskSettings
-from avp_sb3 import AVPVecEnv, EvaluationCallback, evaluate_policy
+from avp_sb3 import AVPVecEnv, EvaluationCallback, MetricsCallback, MLflowCallback, evaluate_policy
 from avp_sb3.best_model import BestModel, BestModelError
 from avp_sb3.evaluation_batch import FixedStarts, means, run_batch, scenes_of
 from avp_sb3.evaluation_picture import draw_curves, evaluation_picture
@@ -300,6 +303,38 @@ class Closing(BaseCallback):
 
     def _on_training_end(self):
         self.logger.output_formats.remove(self.dumps)
+
+
+def test_figures_pictures_and_the_best_model_reach_mlflow_once(tmp_path, monkeypatch):
+    client = MlflowClient(mlflow_home(tmp_path, monkeypatch))
+    tracker = MLflowCallback()
+    callbacks = [tracker, MetricsCallback(), EvaluationCallback(eval_env=corridors(), every=100, best_model="best.zip")]
+    ppo().learn(192, callback=callbacks)
+    run = client.get_run(tracker.run_id)
+    assert run.info.status == "FINISHED"
+    for name, steps in (("eval/coverage", [100, 192]), ("avp/coverage", [64, 128, 192])):
+        assert [point.step for point in client.get_metric_history(tracker.run_id, name)] == steps
+    kept = client.download_artifacts(tracker.run_id, "best_model.zip", str(tmp_path))
+    assert PPO.load(kept, device="cpu").avp_best["value"] == run.data.metrics["eval/best_return"]
+    pictures = [file.path for file in client.list_artifacts(tracker.run_id, "images") if file.path.endswith("png")]
+    assert len([path for path in pictures if "trajectory" in path]) == 2
+
+
+def test_every_format_of_the_logger_takes_an_evaluation(tmp_path):
+    model = ppo()
+    model.set_logger(configure(str(tmp_path), ["stdout", "log", "csv", "json", "tensorboard"]))
+    model.learn(192, callback=EvaluationCallback(eval_env=corridors(), every=100, best_model=tmp_path / "best.zip"))
+    rows = [json.loads(line) for line in (tmp_path / "progress.json").read_text().splitlines()]
+    coverage = {row["time/total_timesteps"]: row["eval/coverage"] for row in rows if "eval/coverage" in row}
+    assert list(coverage) == [100, 192]
+    with (tmp_path / "progress.csv").open() as file:
+        table = [row for row in csv.DictReader(file) if row["eval/coverage"]]
+    assert {int(row["time/total_timesteps"]): float(row["eval/coverage"]) for row in table} == coverage
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert [(event.step, event.value) for event in events.Scalars("eval/coverage")] == [
+        (step, pytest.approx(value)) for step, value in coverage.items()
+    ]
+    assert [event.step for event in events.Images("eval/corridor/trajectory")] == [100, 192]
 
 
 @pytest.mark.parametrize("progress_bar", [False, True])
