@@ -121,6 +121,11 @@ def _parser() -> argparse.ArgumentParser:
         "sqlite:///mlflow.db; auto: MLFLOW_TRACKING_URI if that is set, else nowhere; off: nowhere "
         "(default: %(default)s)",
     )
+    add(
+        "--experiment",
+        metavar="NAME",
+        help="MLflow experiment of the run when that of the policy's training is not there (default: avp)",
+    )
     return parser
 
 
@@ -143,15 +148,16 @@ def _request(options: argparse.Namespace) -> Request:
     )
 
 
-def _track(out: Path, option: str) -> None:
+def _track(out: Path, option: str, experiment: str | None) -> None:
     """Log the rollout; a store that fails is a warning, because the rollout is complete and can be logged later."""
     address = address_of(option, default=None)
     if address is None:
         return
     try:
-        print(about_run(rollout_run(address, out), address))
+        print(about_run(rollout_run(address, out, experiment=experiment), address))
     except TrackingError as error:
-        print(f"warning: {error}; the rollout is complete, log it later: {command_for(out, option)}", file=sys.stderr)
+        later = command_for(out, option, experiment)
+        print(f"warning: {error}; the rollout is complete, log it later: {later}", file=sys.stderr)
 
 
 def main(argv: Sequence[str]) -> None:
@@ -165,7 +171,7 @@ def main(argv: Sequence[str]) -> None:
     print(f"{request.out}: {episode['views']:.0f} views, coverage {100 * episode['coverage']:.1f} %")
     for name, value in episode.items():
         print(f"  {name:<20} {value:.4g}")
-    _track(request.out, options.mlflow)
+    _track(request.out, options.mlflow, options.experiment)
     print(f"look:         {out}/trajectory.png")
     track = "" if options.mlflow in ("auto", "off") else f" --mlflow {shlex.quote(shown(options.mlflow))}"
     print(f"reconstruct:  ns-train avp-nerfacto --data {out}{track}")

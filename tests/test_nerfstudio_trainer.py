@@ -116,6 +116,25 @@ def test_runs_above_in_another_experiment_are_named_without_becoming_the_parent(
         assert (run.data.tags.get("mlflow.parentRunId") == rollout.info.run_id) is nested
 
 
+def test_a_reconstruction_from_several_rollouts_is_below_their_policy_if_it_is_one(tmp_path, room, store):
+    other = write_room(tmp_path / "other")
+    policies = [store.create_run(store.create_experiment(name)).info.run_id for name in ("one", "two")]
+    config = tiny_config(room, tmp_path)
+    parser = config.pipeline.datamanager.dataparser
+    parser.data, parser.also = room, (other,)
+    for others_policy, parent in ((policies[0], policies[0]), (policies[1], None)):
+        tell_origin(room, seed=1, mlflow_run_id=policies[0])
+        tell_origin(other, seed=2, mlflow_run_id=others_policy)
+        opened = open_run("sqlite:///mlflow.db", facts_of(config), folder=tmp_path)
+        opened.close("FINISHED")
+        tags = store.get_run(opened.run_id).data.tags
+        assert tags.get("mlflow.parentRunId") == parent
+        rollouts = [store.get_run(run_id) for run_id in tags["avp.rollout_run"].split(", ")]
+        assert [run.data.params["rollout.seed"] for run in rollouts] == ["1", "2"]
+        assert [run.data.tags["mlflow.parentRunId"] for run in rollouts] == [policies[0], others_policy]
+        assert tags["avp.policy_run"] == ", ".join(dict.fromkeys([policies[0], others_policy]))
+
+
 def test_an_interrupted_training_saves_what_it_learned_and_goes_on_from_there(
     tmp_path, room, store, monkeypatch, capsys
 ):

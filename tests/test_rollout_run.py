@@ -250,8 +250,9 @@ def test_figures_that_are_no_numbers_are_left_out():
 
 
 def test_a_collected_rollout_is_logged_where_the_environment_says(store, tmp_path, capsys):
-    assert collect("--policy", "random", "--out", tmp_path / "r") == 0
+    assert collect("--policy", "random", "--out", tmp_path / "r", "--experiment", "mine") == 0
     (run,) = runs(store)
+    assert store.get_experiment(run.info.experiment_id).name == "mine"
     told = capsys.readouterr().out
     assert f"MLflow:   run {run.info.run_id}\ncompare:  mlflow ui --backend-store-uri {store.tracking_uri}" in told
     assert run.data.tags["avp.rollout_id"] == rollout_id(tmp_path / "r")
@@ -284,7 +285,7 @@ def test_a_mistyped_address_is_told_before_anything_is_collected(tmp_path, monke
 def test_a_named_server_that_does_not_answer_stops_the_collection_unless_it_is_offline(tmp_path, monkeypatch, capsys):
     address = f"127.0.0.1:{free_port()}"
     monkeypatch.chdir(tmp_path)
-    words = ["--policy", "random", "--out", "r", "--mlflow", f"http://me:secret@{address}"]
+    words = ["--policy", "random", "--out", "r", "--mlflow", f"http://me:secret@{address}", "--experiment", "a b"]
     assert collect(*words) == 1
     told = capsys.readouterr().err
     assert told.startswith(f"error: MLflow at http://{address} cannot be used: no server answers there")
@@ -293,7 +294,8 @@ def test_a_named_server_that_does_not_answer_stops_the_collection_unless_it_is_o
     monkeypatch.setenv("AVP_MLFLOW_OFFLINE", "1")
     assert collect(*words) == 0
     warning = capsys.readouterr().err.strip().splitlines()[-1]
-    assert warning.endswith(f"log it later: python -m avp_habitat.tracking.rollout_run r --mlflow http://{address}")
+    later = f"python -m avp_habitat.tracking.rollout_run r --mlflow http://{address} --experiment 'a b'"
+    assert warning.endswith(f"log it later: {later}")
 
 
 def test_logging_nowhere_is_refused(rollout, capsys):

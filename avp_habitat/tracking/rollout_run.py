@@ -211,15 +211,17 @@ def _alone(identity: str) -> Iterator[None]:
         yield
 
 
-def command_for(folder: Path, option: str) -> str:
+def command_for(folder: Path, option: str, experiment: str | None = None) -> str:
     """The command line that logs a rollout.
 
     Args:
         folder: of the rollout.
         option: `auto`, or an address; its password is not repeated.
+        experiment: as in `rollout_run`.
     """
     words = ["python", "-m", "avp_habitat.tracking.rollout_run", str(folder)]
-    return shlex.join(words if option == "auto" else [*words, "--mlflow", shown(option)])
+    words += [] if option == "auto" else ["--mlflow", shown(option)]
+    return shlex.join(words if experiment is None else [*words, "--experiment", experiment])
 
 
 def _parser() -> argparse.ArgumentParser:
