@@ -1,3 +1,4 @@
+import sysconfig
 import tomllib
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -29,6 +30,13 @@ def test_the_installed_entry_points_are_the_declared_ones():
         if point.dist is not None and point.dist.name == "avp-suite"
     }
     assert ours == declared()
+
+
+def test_the_manifest_and_the_installed_programs_are_the_same():
+    listed = {p["name"]: p["object"] for p in PLUGINS if p["group"] == "program on the path"}
+    assert listed == PROJECT["scripts"]
+    for name in listed:
+        assert (Path(sysconfig.get_path("scripts")) / name).is_file()
 
 
 @pytest.mark.parametrize("plugin", PLUGINS, ids=lambda plugin: plugin["name"])
