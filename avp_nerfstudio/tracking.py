@@ -10,6 +10,7 @@ from avp_habitat.tracking.addresses import shown
 from avp_habitat.tracking.journal import spool_folder
 from avp_habitat.tracking.looking import about_run
 from avp_habitat.tracking.recovery import Recovered, recover_in_background
+from avp_habitat.tracking.remote import OFFLINE
 from avp_habitat.tracking.run import Status, TrackedRun
 from avp_nerfstudio.tracking_events import ScalarWriter, Sink
 from avp_nerfstudio.tracking_facts import facts_of
@@ -51,6 +52,7 @@ class Trackers:
             experiment=config.mlflow_experiment,
             earlier=remembered_id(config.load_dir.parent) if config.load_dir is not None else None,
         )
+        print(about_run(run.run_id, run.address, delivered=not run.run_id.startswith(OFFLINE)))
         recover_in_background(spool_folder(), _tell_recovered)
         return cls(run, recording)
 
