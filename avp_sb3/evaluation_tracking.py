@@ -20,13 +20,14 @@ from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, TrackingError, conne
 from avp_habitat.tracking.names import safe_name
 from avp_habitat.tracking.view import COLOUR_TAG, NOTE_TAG, prepare_experiment, run_colour
 from avp_sb3.evaluation import PolicyResult
-from avp_sb3.evaluation_report import PLOT_FILE, ReportError, cells, cpv, summary, table
+from avp_sb3.evaluation_report import PLOT_FILE, ReportError, cells, cpv, summary
 from avp_sb3.evaluation_statistics import mean_and_half_width
 from avp_sb3.run_facts import version_tags
 
 TABLE = "policies.json"
 """Artifact of the upper run that MLflow's page shows as a table."""
 KIND_TAG, KIND = "avp.kind", "evaluation"
+_TOLD = ("policy", "coverage [%]", "views", "CpV [%/view]", "ended by a stop [%]", "episodes")
 _PREFIX = "eval"
 _MAX_PARAM, _MAX_TAG = 6000, 5000
 
@@ -84,15 +85,14 @@ def _log(
 ) -> str:
     tags = _tags(about)
     params = [Param(safe_name(name), str(value)[:_MAX_PARAM]) for name, value in flat(about).items()]
-    parent = client.create_run(experiment, run_name="evaluation", tags=tags | {KIND_TAG: KIND}).info.run_id
+    parent = client.create_run(experiment, run_name="evaluation", tags=tags).info.run_id
     client.log_batch(parent, params=params)
     names = _names(results)
     for result, name in zip(results, names, strict=True):
         own = {"mlflow.parentRunId": parent, "avp.policy": name, COLOUR_TAG: run_colour(name)}
         own |= {"avp.policy_run": result.training_run} if result.training_run else {}
         run = client.create_run(experiment, run_name=name, tags=tags | own).info.run_id
-        more = [Param("policy", result.policy), Param("observation", str(result.observation))]
-        client.log_batch(run, metrics=_metrics(result), params=[*params, *more])
+        client.log_batch(run, metrics=_metrics(result), params=_own_params(result, about))
         if result.policy in pictures:
             client.log_image(run, pictures[result.policy], key=f"{_PREFIX}/trajectory", step=0)
         client.set_terminated(run, status)
@@ -103,8 +103,17 @@ def _log(
     return parent
 
 
+def _own_params(result: PolicyResult, about: Mapping[str, Any]) -> list[Param]:
+    """Few: the page writes all of a run's above its picture; the upper run has the others, which all policies share."""
+    settings = about.get("settings")
+    shared = {name: about.get(name) for name in ("episodes", "seed")}
+    shared["budget"] = settings.get("budget") if isinstance(settings, Mapping) else None
+    own = {"policy": result.policy, "observation": result.observation, **shared}
+    return [Param(name, str(value)[:_MAX_PARAM]) for name, value in own.items() if value is not None]
+
+
 def _tags(about: Mapping[str, Any]) -> dict[str, str]:
-    tags = dict(resolve_tags()) | version_tags()
+    tags = dict(resolve_tags()) | version_tags() | {KIND_TAG: KIND}
     if (commit := git_commit()) is not None:
         tags["mlflow.source.git.commit"] = commit
     scene = about.get("scene")
@@ -122,9 +131,14 @@ def _names(results: Sequence[PolicyResult]) -> list[str]:
 
 
 def _log_table(client: MlflowClient, run: str, results: Sequence[PolicyResult], names: Sequence[str]) -> None:
-    """The policies as rows of a table, and as the text that the page shows above everything else."""
-    client.log_table(run, {"policy": list(names), **cells(results)}, TABLE)
-    client.set_tag(run, NOTE_TAG, f"{table(results)}\n\nMean ± half of the 95 % interval over the episodes."[:_MAX_TAG])
+    """The policies as rows of a table; the most telling columns also as text that the page shows above all else."""
+    columns = {"policy": list(names), **cells(results)}
+    client.log_table(run, columns, TABLE)
+    told = {title: columns[title] for title in _TOLD if title in columns}
+    rows = [told, ["---"] * len(told), *zip(*told.values(), strict=True)]
+    lines = [f"| {' | '.join(row)} |" for row in rows]
+    note = "\n".join([*lines, "", "Means over the episodes; ± is half of the 95 % interval."])
+    client.set_tag(run, NOTE_TAG, note[:_MAX_TAG])
 
 
 def _log_plot(client: MlflowClient, run: str, path: Path) -> None:

@@ -23,6 +23,7 @@ from avp_habitat.tracking.view import (
     VIEWS,
     path_of,
     prepare_experiment,
+    run_colour,
 )
 
 
@@ -79,6 +80,19 @@ def test_the_table_holds_means_and_students_intervals_by_scene_policy_and_method
     assert (rows[3]["coverage [%]"], rows[3]["PSNR [dB]"]) == ("50.0 ± 1.0", "–")
 
 
+def test_a_rollout_counts_once_beside_its_reconstruction(store):
+    found, room = store.create_experiment("avp"), {"scene": "room.glb", "policy": "a"}
+    figures = {"coverage": 0.9, "views": 40}
+    rollout = make_run(store, found, figures, kind="rollout", **room)
+    make_run(store, found, {**figures, "psnr": 24.0}, kind="reconstruction", method="nerf", rollout_run=rollout, **room)
+    make_run(store, found, {"coverage": 0.4, "views": 20}, kind="rollout", **room)
+    rows = parsed(markdown(compare(collect_runs(store, found))))
+    assert [(row["method"], row["runs"], row["views"]) for row in rows] == [
+        ("nerf", "1", "40.0"),
+        ("rollout", "1", "20.0"),
+    ]
+
+
 def test_the_best_reconstruction_of_a_scene_comes_first():
     def run(policy, **metrics):
         return RunFigures(policy, policy, "room", "nerf", {f"eval/{name}": value for name, value in metrics.items()})
@@ -117,13 +131,14 @@ def test_each_set_of_scenes_has_a_run_of_its_own(store, experiment):
     assert sorted(run.data.tags["avp.scene"] for run in found) == ["other.glb, room.glb", "room.glb"]
 
 
-def test_the_picture_shows_the_reconstructions(store, experiment, tmp_path):
+def test_the_picture_shows_the_policies_that_have_a_reconstruction_in_their_colours(store, experiment, tmp_path):
+    make_run(store, experiment, {"coverage": 0.5, "views": 80}, policy="greedy", scene="room.glb")
     assert run_command("--out", tmp_path / "out") == 0
     picture = np.asarray(Image.open(tmp_path / "out" / "comparison.png").convert("RGB"))
-    # One colour of matplotlib's cycle for each of the three methods that have a reconstruction.
-    colours = {tuple(colour) for colour in picture.reshape(-1, 3)}
-    assert {(31, 119, 180), (255, 127, 14), (44, 160, 44)} <= colours
-    assert (214, 39, 40) not in colours
+    drawn = {"#{:02x}{:02x}{:02x}".format(*colour) for colour in np.unique(picture.reshape(-1, 3), axis=0)}
+    assert len({run_colour(policy) for policy in ("a", "b", "greedy")}) == 3
+    assert {run_colour("a"), run_colour("b")} <= drawn
+    assert run_colour("greedy") not in drawn
 
 
 @pytest.mark.parametrize(

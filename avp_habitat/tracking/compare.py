@@ -32,7 +32,7 @@ from avp_habitat.tracking.comparison import (
     markdown,
     picture,
 )
-from avp_habitat.tracking.view import prepare_experiment
+from avp_habitat.tracking.view import MODEL_TRAINING, prepare_experiment
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -189,7 +189,7 @@ def _publish(folder: Path, methods: Sequence[Method]) -> None:
 
 
 def _look(address: str, experiment_id: str, run_id: str) -> str:
-    page = f"#/experiments/{experiment_id}/runs/{run_id}"
+    page = f"#/experiments/{experiment_id}/runs/{run_id}?{MODEL_TRAINING}"
     if urlsplit(address).scheme in ("http", "https"):
         return f"{shown(address).rstrip('/')}/{page}"
     return f"mlflow ui --backend-store-uri {shlex.quote(shown(address))}, then http://127.0.0.1:5000/{page}"

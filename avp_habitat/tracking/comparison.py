@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
 
 KIND_TAG, KIND = "avp.kind", "comparison"
+ROLLOUT_RUN_TAG = "avp.rollout_run"
+"""Of a reconstruction: the run of the rollout that it was made from."""
 METHOD_TAG, POLICY_TAG, SCENE_TAG = "avp.method", "avp.policy", "avp.scene"
 EVALUATION = "evaluation"
 """Method of a run that has no reconstruction."""
@@ -100,9 +102,11 @@ def collect_runs(client: "MlflowClient", experiment_id: str, scenes: Sequence[st
         experiment_id: where to look.
         scenes: names; all when empty.
     """
-    query = "metrics.`eval/coverage` >= 0"
-    found = [figures for run in _search(client, experiment_id, query) if (figures := _figures(run)) is not None]
-    return [figures for figures in found if not scenes or figures.scene in scenes]
+    found = list(_search(client, experiment_id, "metrics.`eval/coverage` >= 0"))
+    # A reconstruction carries the figures of its rollout, which would otherwise count twice.
+    rollouts = {run.data.tags.get(ROLLOUT_RUN_TAG) for run in found}
+    figures = [_figures(run) for run in found if run.info.run_id not in rollouts]
+    return [one for one in figures if one is not None and (not scenes or one.scene in scenes)]
 
 
 def compare(runs: Iterable[RunFigures]) -> list[Method]:

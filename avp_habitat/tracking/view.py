@@ -34,37 +34,36 @@ _COLOURS = {
 }
 _MODEL_COLOURS = ("#d62728", "#ff7f0e", "#2ca02c", "#a55194", "#637939", "#843c39", "#e7969c", "#e7ba52")
 _LOG = logging.getLogger(__name__)
-_MODEL_TRAINING = "workflowType=machine_learning"
+MODEL_TRAINING = "workflowType=machine_learning"
+"""Parameter of an address: MLflow 3.17 shows pages of traces first to a browser that has never been there."""
 
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart of the page, one colour per run."""
+    """A chart of the page: a bar per run, unless it says otherwise; one colour per run."""
 
-    title: str
-    """Shown above it."""
     metric: str
-    """On its y axis."""
+    """On its y axis, or the name of its pictures."""
     by: str | None = None
-    """Metric on its x axis; None for a bar per run, or the steps of a `line`."""
+    """Metric on its x axis, for a point per run."""
     line: bool = False
     """Whether it shows the course of the metric by step."""
+    pictures: bool = False
+    """Whether it shows pictures side by side."""
 
     def state(self, section: str, number: int) -> dict[str, Any]:
         """As MLflow's page keeps it."""
-        common = {
-            "uuid": f"{section}-{number}",
-            "metricSectionId": section,
-            "deleted": False,
-            "isGenerated": False,
-            "displayName": self.title,
-            "runsCountToCompare": 100,
-        }
+        place = {"uuid": f"{section}-{number}", "metricSectionId": section, "deleted": False, "isGenerated": False}
+        return {**place, "runsCountToCompare": 100, **self._kind()}
+
+    def _kind(self) -> dict[str, Any]:
+        if self.pictures:
+            return {"type": "IMAGE", "imageKeys": [self.metric], "step": 0}
         if self.by is not None:
             axes = {"xaxis": {"key": self.by, "type": "METRIC"}, "yaxis": {"key": self.metric, "type": "METRIC"}}
-            return common | {"type": "SCATTER", **axes}
+            return {"type": "SCATTER", **axes}
         if not self.line:
-            return common | {"type": "BAR", "metricKey": self.metric}
+            return {"type": "BAR", "metricKey": self.metric}
         steps = {
             "xAxisKey": "step",
             "selectedXAxisMetricKey": "",
@@ -73,7 +72,7 @@ class Chart:
         }
         values = {"yAxisKey": "metric", "yAxisExpressions": [], "scaleType": "linear", "range": {}, "lineSmoothness": 0}
         keys = {"metricKey": self.metric, "selectedMetricKeys": [self.metric], "useGlobalLineSmoothing": True}
-        return common | {"type": "LINE", **keys, **steps, **values}
+        return {"type": "LINE", **keys, **steps, **values}
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,7 @@ class View:
             "modelVersionFilter": "All Runs",
             "selectedColumns": list(self.columns),
             "columnOrder": list(self.columns),
-            "columnWidths": {},
+            "columnWidths": {column: _WIDTHS.get(column, _WIDTH) for column in self.columns},
             "runsExpanded": {},
             "runsPinned": [],
             "runsHidden": [],
@@ -145,30 +144,31 @@ def _tag(name: str) -> str:
     return f"tags.`{name}`"
 
 
-_WHO = (_tag("avp.policy"), _tag("avp.scene"))
+def _param(name: str) -> str:
+    return f"params.`{name}`"
+
+
+_WIDTH = 110
+_WIDTHS = {
+    _tag("avp.policy"): 150,
+    _tag("avp.scene"): 130,
+    _tag("avp.method"): 120,
+    _metric("eval/coverage"): 125,
+    _metric("eval/coverage_ci95"): 160,
+    _metric("avp/coverage"): 125,
+    _metric("rollout/ep_rew_mean"): 170,
+    _param("env.reward"): 130,
+    _param("env.observation"): 140,
+}
+"""Pixels that hold a column's name."""
 RECONSTRUCTIONS = View(
     key="avp-reconstructions",
     title="Reconstructions by policy",
     runs="metrics.`eval/psnr` > -1000",
     columns=(_tag("avp.policy"), *map(_metric, FIGURES), _tag("avp.scene"), _tag("avp.method")),
     sections=(
-        (
-            "Up and left is better",
-            (
-                Chart("PSNR [dB] by views", "eval/psnr", by="eval/views"),
-                Chart("PSNR [dB] by coverage", "eval/psnr", by="eval/coverage"),
-            ),
-        ),
-        (
-            "A bar per run",
-            (
-                Chart("PSNR [dB]", "eval/psnr"),
-                Chart("views", "eval/views"),
-                Chart("coverage", "eval/coverage"),
-                Chart("SSIM", "eval/ssim"),
-                Chart("LPIPS, less is better", "eval/lpips"),
-            ),
-        ),
+        ("Up and left is better", (Chart("eval/psnr", by="eval/views"), Chart("eval/psnr", by="eval/coverage"))),
+        ("A bar per run", tuple(map(Chart, FIGURES))),
     ),
     order=_metric("eval/psnr"),
 )
@@ -177,20 +177,14 @@ EVALUATIONS = View(
     title="Evaluations by policy",
     runs="metrics.`eval/curve` >= 0",
     columns=(
-        *_WHO,
-        *map(_metric, ("eval/views", "eval/coverage", "eval/coverage_ci95", "eval/cpv", "eval/stopped")),
+        _tag("avp.policy"),
+        *map(_metric, ("eval/coverage", "eval/coverage_ci95", "eval/views", "eval/cpv", "eval/stopped")),
         _metric("eval/episodes"),
+        _tag("avp.scene"),
     ),
     sections=(
-        ("Coverage by view", (Chart("coverage after each view", "eval/curve", line=True),)),
-        (
-            "A bar per policy",
-            (
-                Chart("coverage", "eval/coverage"),
-                Chart("views", "eval/views"),
-                Chart("CpV [% per view]", "eval/cpv"),
-            ),
-        ),
+        ("Coverage by view", (Chart("eval/curve", line=True), Chart("eval/trajectory", pictures=True))),
+        ("A bar per policy", (Chart("eval/coverage"), Chart("eval/views"), Chart("eval/cpv"))),
     ),
     order=_metric("eval/coverage"),
 )
@@ -201,28 +195,26 @@ TRAININGS = View(
     columns=(
         _tag("avp.scene"),
         *map(_metric, ("avp/coverage", "avp/views", "avp/cpv", "rollout/ep_rew_mean", "time/fps")),
-        "params.`env.reward`",
-        "params.`env.observation`",
-        "params.`seed`",
+        *map(_param, ("env.reward", "env.observation", "seed")),
     ),
     sections=(
         (
             "By environment step",
-            (
-                Chart("coverage", "avp/coverage", line=True),
-                Chart("views per episode", "avp/views", line=True),
-                Chart("CpV [% per view]", "avp/cpv", line=True),
-                Chart("return", "rollout/ep_rew_mean", line=True),
-                Chart("share of episodes that stop", "avp/stop_share", line=True),
-                Chart("redundant views per episode", "avp/redundant_views", line=True),
+            tuple(
+                Chart(name, line=True)
+                for name in (
+                    "avp/coverage",
+                    "avp/views",
+                    "avp/cpv",
+                    "rollout/ep_rew_mean",
+                    "avp/stop_share",
+                    "avp/redundant_views",
+                )
             ),
         ),
         (
             "Evaluations by environment step",
-            (
-                Chart("coverage on the evaluation's scenes", "eval/coverage", line=True),
-                Chart("views on the evaluation's scenes", "eval/views", line=True),
-            ),
+            tuple(Chart(name, line=True) for name in ("eval/coverage", "eval/views", "eval/cpv")),
         ),
     ),
 )
@@ -233,7 +225,7 @@ VIEWS: Sequence[View] = (RECONSTRUCTIONS, EVALUATIONS, TRAININGS)
 def path_of(experiment_id: str, view: View = RECONSTRUCTIONS, *, charts: bool = False) -> str:
     """What follows the server's address, to open a view as a table or as `charts`."""
     mode = "&compareRunsMode=CHART" if charts else ""
-    return f"#/experiments/{experiment_id}/runs?{_MODEL_TRAINING}&viewStateShareKey={view.key}{mode}"
+    return f"#/experiments/{experiment_id}/runs?{MODEL_TRAINING}&viewStateShareKey={view.key}{mode}"
 
 
 def run_colour(policy: str) -> str:
