@@ -4,6 +4,11 @@ The three rewards share these values; choose one by `--env-kwargs reward:"'cover
 `--device cpu`. PPO's buffer is `n_envs` times `n_steps`: change both together, for example `-params n_envs:4
 n_steps:512`. To train in several rooms:
 `-params vec_env_wrapper:"{'avp_sb3.zoo.Batched': {'scenes': ['builtin:1', 'builtin:2']}}"`.
+
+Every training is a run of MLflow and leaves some of its episodes as `runs/avp-DATE-TIME.rrd` for Rerun. To have the
+policy evaluated on other scenes too, and the best model kept, name all callbacks again:
+`-params callback:"['avp_sb3.MLflowCallback', 'avp_sb3.MetricsCallback', 'avp_sb3.RerunCallback',
+{'avp_sb3.EvaluationCallback': {'scenes': ['builtin:7', 'builtin:8'], 'every': 50000}}]"`.
 """
 
 from typing import Any
@@ -15,7 +20,7 @@ _COMMON: dict[str, Any] = {
     "policy": "MlpPolicy",
     "vec_env_wrapper": "avp_sb3.zoo.Batched",
     # When a training is interrupted rl_zoo3 ends the first callback only: the MLflow run is the one to close.
-    "callback": ["avp_sb3.MLflowCallback", "avp_sb3.MetricsCallback"],
+    "callback": ["avp_sb3.MLflowCallback", "avp_sb3.MetricsCallback", "avp_sb3.RerunCallback"],
 }
 
 hyperparams: dict[str, dict[str, Any]] = {"AVP-v0": TABLE_4.zoo() | _COMMON}

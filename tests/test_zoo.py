@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from mlflow import MlflowClient
 from rl_zoo3.exp_manager import ExperimentManager
+from rrd import rows, verify
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
@@ -168,7 +169,8 @@ def test_rl_zoo3_reads_table_4(home):
     assert found == {"ent_coef": 0.02, "n_epochs": 10, "batch_size": 512, "gae_lambda": 0.95, "gamma": 0.99}
     assert (model.learning_rate(1.0), model.learning_rate(0.0)) == (3e-4, 3e-4)
     assert (model.clip_range(1.0), model.clip_range(0.0)) == (0.2, 0.2)
-    assert [type(callback).__name__ for callback in manager.callbacks] == ["MLflowCallback", "MetricsCallback"]
+    names = [type(callback).__name__ for callback in manager.callbacks]
+    assert names == ["MLflowCallback", "MetricsCallback", "RerunCallback"]
 
 
 def test_rl_zoo3_trains_logs_and_saves_what_collect_can_use(home):
@@ -208,6 +210,54 @@ def test_the_commands_train_in_processes_enjoy_and_record(home):
         assert "2 Episodes" in enjoyed.stdout
         assert re.search(words, enjoyed.stdout)
     assert len(read_rollout(home / "enjoyed").frames) == 6
+
+
+FEW = ["n_envs:4", "n_steps:16", "batch_size:32", "n_epochs:1"]
+
+
+def only_run():
+    client = MlflowClient()
+    (run,) = client.search_runs([client.get_experiment_by_name("avp").experiment_id])
+    return run
+
+
+def steps_of(run, metric):
+    return [point.step for point in MlflowClient().get_metric_history(run.info.run_id, metric)]
+
+
+@pytest.mark.slow
+def test_the_configuration_alone_logs_to_mlflow_and_rerun(home):
+    words = [*TRAIN, "-n", "192", "-params", *FEW]
+    trained = subprocess.run(line("train", *words), cwd=home, capture_output=True, text=True, timeout=300)
+    assert trained.returncode == 0, trained.stderr
+    run = only_run()
+    assert run.info.status == "FINISHED"
+    assert steps_of(run, "rollout/ep_rew_mean") == steps_of(run, "avp/coverage") == [64, 128, 192]
+    assert run.data.params["n_steps"] == "16"
+    assert "model.zip" in {file.path for file in MlflowClient().list_artifacts(run.info.run_id)}
+    (recording,) = (home / "runs").glob("avp-*.rrd")
+    verify(recording)
+    assert len(rows(recording, "/plots/coverage", "Scalars:scalars")) >= 6, "the first episode at least"
+
+
+@pytest.mark.slow
+def test_the_evaluation_is_added_by_the_documented_option(home):
+    option = re.search(r"`-params (callback:.*)`\.", hyperparams.__doc__, re.DOTALL)[1]
+    option = option.replace('callback:"', "callback:").rstrip('"').replace("\n", " ")
+    option = option.replace("'every': 50000", "'every': 100, 'episodes': 2, 'best_model': 'best.zip'")
+    words = [*TRAIN, "-n", "192", "-params", *FEW, option]
+    trained = subprocess.run(line("train", *words), cwd=home, capture_output=True, text=True, timeout=300)
+    assert trained.returncode == 0, trained.stderr
+    run = only_run()
+    assert steps_of(run, "eval/coverage") == [100, 192]
+    assert {"eval/cpv", "eval/return", "eval/builtin_7/coverage", "eval/builtin_8/views"} <= run.data.metrics.keys()
+    assert run.data.metrics["eval/coverage"] == pytest.approx(
+        (run.data.metrics["eval/builtin_7/coverage"] + run.data.metrics["eval/builtin_8/coverage"]) / 2
+    )
+    best = PPO.load(home / "best.zip", device="cpu")
+    assert best.avp_best["value"] == pytest.approx(run.data.metrics["eval/best_return"])
+    kept = MlflowClient().download_artifacts(run.info.run_id, "best_model.zip", str(home))
+    assert PPO.load(kept, device="cpu").num_timesteps == best.num_timesteps
 
 
 @pytest.mark.slow
