@@ -1,8 +1,13 @@
 import io
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
+import rerun as rr
 from corridor import ROOM, WALL
 from PIL import Image
 from rerun.chunk import RrdReader
@@ -17,7 +22,7 @@ from avp_habitat.poses import Intrinsics
 from avp_sb3 import RerunCallback
 from avp_sb3.finished_episodes import MissingInfoError
 from avp_sb3.rerun_callback import RecordingError
-from avp_sb3.rerun_episode import spread_indices
+from avp_sb3.rerun_episode import Episode, log_episode, spread_indices
 
 
 class Notes(BaseCallback):
@@ -243,3 +248,146 @@ def test_an_environment_without_trajectories_is_named(tmp_path):
 @pytest.mark.parametrize(("count", "at_most", "chosen"), [(0, 3, []), (2, 3, [0, 1]), (5, 3, [0, 2, 4]), (5, 0, [])])
 def test_indices_are_spread_from_the_first_to_the_last(count, at_most, chosen):
     assert spread_indices(count, at_most) == chosen
+
+
+class Bare(gymnasium.Wrapper):
+    """An environment of somebody else, which reports trajectories and nothing else."""
+
+    def __init__(self, env, hidden=("area", "capture", "scene_name", "settings"), figures=True):
+        super().__init__(env)
+        self.hidden, self.figures = hidden, figures
+
+    def get_wrapper_attr(self, name):
+        if name in self.hidden:
+            raise AttributeError(name)
+        return super().get_wrapper_attr(name)
+
+    def step(self, action):
+        *outcome, info = self.env.step(action)
+        if not self.figures:
+            info.pop("avp_episode", None)
+        return *outcome, info
+
+
+@pytest.mark.parametrize(
+    ("hidden", "lost", "said"),
+    [
+        (("area", "capture", "scene_name", "settings"), {"room", "floor", "camera"}, ("'area'", "'capture'")),
+        (("capture",), {"room", "camera"}, ("'capture'",)),
+        (("area",), {"room", "floor"}, ("'area'",)),
+    ],
+)
+def test_environments_without_area_or_pictures_are_recorded_without_them(tmp_path, capsys, hidden, lost, said):
+    path = tmp_path / "a.rrd"
+    callback = RerunCallback(path, every=1, max_share=1, pictures=1, width=16, height=12)
+    ppo(Bare(SmallEnv(), hidden)).learn(64, callback=callback)
+    verify(path)
+    world = {entity.split("/")[2] for entity in entities(path) if entity.startswith("/world/")}
+    assert world == {"room", "floor", "camera", "path", "views", "agent"} - lost
+    lines = [line for line in capsys.readouterr().err.splitlines() if "the environment has no" in line]
+    assert [name for name in ("'area'", "'capture'") if any(name in line for line in lines)] == sorted(said)
+    assert len(lines) == len(said)
+
+
+def test_environments_without_figures_are_recorded_without_curves(tmp_path, capsys):
+    path = tmp_path / "a.rrd"
+    ppo(Bare(SmallEnv(), (), figures=False)).learn(64, callback=RerunCallback(path, pictures=0))
+    assert rows(path, "/plots/coverage", "Scalars:scalars")
+    assert not [entity for entity in entities(path) if entity.startswith("/metrics")]
+    assert capsys.readouterr().err.count("no 'avp_episode' in info at the end of an episode") == 1
+
+
+class OtherScene(SmallEnv):
+    scene_name = "other (2)"
+
+
+def test_each_of_several_scenes_has_its_own_room(tmp_path):
+    path = tmp_path / "a.rrd"
+    envs = DummyVecEnv([SmallEnv, OtherScene])
+    callback = RerunCallback(path, every=1, max_share=1, pictures=1, width=16, height=12)
+    ppo(envs).learn(128, callback=callback)
+    verify(path)
+    names = {f"/{rr.escape_entity_path_part(name)}" for name in envs.get_attr("scene_name")}
+    assert len(names) == 2
+    assert {entity.rpartition("/world/room")[0] for entity in entities(path) if "room" in entity} == names
+    numbers = [{time for time, _ in rows(path, f"{name}/plots/coverage", "Scalars:scalars")} for name in names]
+    assert not numbers[0] & numbers[1]
+    assert sorted(numbers[0] | numbers[1]) == list(range(len(numbers[0] | numbers[1])))
+
+
+def run_training(path, how):
+    """A training in a process of its own, in the way of `how`; what it printed."""
+    command = [sys.executable, "-c", _TRAINING, str(path), how]
+    return subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, timeout=300)
+
+
+_TRAINING = """
+import os, resource, signal, sys
+from stable_baselines3.common.callbacks import BaseCallback
+from tracking import ppo
+from avp_sb3 import RerunCallback
+
+path, how = sys.argv[1:]
+if how == "full disk":
+    resource.setrlimit(resource.RLIMIT_FSIZE, (700_000, 700_000))
+
+class End(BaseCallback):
+    def _on_step(self):
+        if self.n_calls == 90 and how == "SIGKILL":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.n_calls == 90 and how == "Ctrl-C":
+            raise KeyboardInterrupt
+        return True
+
+recorder = RerunCallback(path, every=1, max_share=1, pictures=1, width=32, height=24)
+ppo().learn(400, callback=[recorder, End()])
+print("done")
+"""
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_a_killed_training_leaves_a_file_with_the_episodes_before(tmp_path):
+    path = tmp_path / "a.rrd"
+    assert run_training(path, "SIGKILL").returncode == -signal.SIGKILL
+    steps = [time for time, _ in rows(path, "/plots/coverage", "Scalars:scalars")]
+    # 90 steps are eleven episodes of at most 8 steps, all of them recorded.
+    episodes = {time for time, _ in rows(path, "/plots/coverage", "Scalars:scalars", "episode")}
+    assert episodes == set(range(1, len(episodes) + 1))
+    assert len(episodes) >= 11
+    assert steps == list(range(len(steps)))
+    assert len(steps) > 90 - 8
+
+
+def test_an_interrupted_training_leaves_a_whole_file(tmp_path):
+    path = tmp_path / "a.rrd"
+    assert "KeyboardInterrupt" in run_training(path, "Ctrl-C").stderr
+    verify(path)
+    episodes = [
+        {time for time, _ in rows(path, name, "Scalars:scalars", "episode")}
+        for name in ("/plots/coverage", "/metrics/coverage")
+    ]
+    assert episodes[0] == episodes[1] != set()
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_a_full_disk_ends_the_recording_and_not_the_training(tmp_path):
+    path = tmp_path / "a.rrd"
+    done = run_training(path, "full disk")
+    assert done.returncode == 0
+    assert "done" in done.stdout
+    assert done.stderr.count("a.rrd: File too large; what came before is kept, the training goes on") == 1
+    assert path.stat().st_size <= 700_000
+    episodes = {time for time, _ in rows(path, "/plots/coverage", "Scalars:scalars", "episode")}
+    assert episodes == set(range(1, len(episodes) + 1)) != set()
+
+
+def test_on_a_large_floor_the_colours_change_less_often():
+    cells, steps = 50_000, 80
+    first_seen = np.arange(cells) % (steps + 1)
+    poses = np.tile(np.eye(4), (steps, 1, 1))
+    camera = Intrinsics.from_hfov(16, 12, hfov_deg=90)
+    episode = Episode(poses, poses[:, :3, 3], camera, {}, {}, np.zeros((cells, 3)), first_seen)
+    recording = rr.RecordingStream("avp", recording_id="large")
+    memory = recording.memory_recording()
+    log_episode(recording, "", episode, number=1)
+    assert len(memory.drain_as_bytes()) < 2_000_000
