@@ -205,9 +205,13 @@ class _Bench:
 
     def delay(self) -> dict[str, Any]:
         """Seconds until a point of a running training is visible to another process."""
+        from mlflow import MlflowClient
+
         from avp_sb3 import MetricsCallback, MLflowCallback
 
-        experiment = f"delay-{self.options.seed}"
+        experiment = "delay"
+        kept = (self.folder / "artifacts").resolve().as_uri()
+        MlflowClient(self.tracking).create_experiment(experiment, artifact_location=kept)
         line = [sys.executable, str(Path(__file__).with_name("callbacks_poll.py")), self.tracking, experiment]
         stop = self.folder / "stop"
         poller = subprocess.Popen([*line, str(stop)], stdout=subprocess.PIPE, text=True)
