@@ -86,6 +86,8 @@ class LiveViewer:
                 f"rerun+http://{_LOOPBACK}:{self._relay.port}/proxy", default_blueprint=blueprint
             )
             self._recording.flush(timeout_sec=_ANSWER_S)
+            if self._relay.lost:
+                raise RuntimeError("it ended the connection")
         except (RuntimeError, ValueError) as error:
             self.finish()
             raise LiveError(f"{self._target}: what listens there is no Rerun viewer ({error})") from None
