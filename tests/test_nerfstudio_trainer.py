@@ -105,7 +105,7 @@ def test_runs_above_in_another_experiment_are_named_without_becoming_the_parent(
         tell_origin(room, mlflow_run_id=policy_run)
         config = tiny_config(room, tmp_path)
         config.pipeline.datamanager.data = room
-        opened = open_run("sqlite:///mlflow.db", facts_of(config), folder=tmp_path, experiment=experiment)
+        opened = open_run(store.tracking_uri, facts_of(config), folder=tmp_path, experiment=experiment)
         opened.close("FINISHED")
         run = store.get_run(opened.run_id)
         rollout = store.get_run(run.data.tags["avp.rollout_run"])
@@ -125,7 +125,7 @@ def test_a_reconstruction_from_several_rollouts_is_below_their_policy_if_it_is_o
     for others_policy, parent in ((policies[0], policies[0]), (policies[1], None)):
         tell_origin(room, seed=1, mlflow_run_id=policies[0])
         tell_origin(other, seed=2, mlflow_run_id=others_policy)
-        opened = open_run("sqlite:///mlflow.db", facts_of(config), folder=tmp_path)
+        opened = open_run(store.tracking_uri, facts_of(config), folder=tmp_path)
         opened.close("FINISHED")
         tags = store.get_run(opened.run_id).data.tags
         assert tags.get("mlflow.parentRunId") == parent
