@@ -21,16 +21,11 @@ from avp_habitat.tracking.view import EVALUATIONS, MODEL_TRAINING, TRAININGS, pa
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
+    from playwright.sync_api import Page
 
 POLICIES = ("heuristic", "spin", "survey")
 LARGEST_BYTES = 200_000
 _SETTLE_S = 3.0
-# The compare page begins with a plot; its metrics are a grid further below that scrolls by itself.
-_TO_METRICS = """() => {
-    const [names, values] = document.querySelectorAll(".ReactVirtualized__Grid");
-    names.scrollIntoView({block: "center"});
-    values.scrollTop = values.scrollHeight;
-}"""
 _FIGURES = "metrics.`eval/psnr` > -1000"
 
 
@@ -123,13 +118,26 @@ def _photograph(store: str, experiment: str, out: Path, folder: Path) -> None:
         for name, (path, sign, height) in pages.items():
             with opened(browser, address, path, size=(1400, height)) as page:
                 page.wait_for_selector(sign)
-                if name == "compare":
-                    page.evaluate(_TO_METRICS)
+                _reveal(page, name)
                 # Charts are drawn and pictures fetched one after the other, and nothing tells the last.
                 time.sleep(_SETTLE_S)
                 shot = folder / f"{name}.png"
                 page.screenshot(path=shot)
             print(_jpeg(shot, out / f"mlflow-{name}.jpg"))
+
+
+def _reveal(page: "Page", name: str) -> None:
+    """Bring to sight what a page shows only when it is asked."""
+    if name == "compare":
+        # Far below are a grid of values and one of their names, which is always one turn of the wheel late.
+        values = page.locator(".ReactVirtualized__Grid").last
+        values.scroll_into_view_if_needed()
+        values.hover()
+        for turn in (10_000, -1, -1):
+            page.mouse.wheel(0, turn)
+            page.wait_for_timeout(1000)
+    if name == "comparison":
+        page.get_by_text("Show more", exact=True).first.click()
 
 
 def _compare_path(experiment: str, runs: Sequence[str]) -> str:
