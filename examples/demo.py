@@ -91,7 +91,7 @@ class Demo:
         model, recording = self.folder / "learned.zip", self.folder / "training.rrd"
         options = ("--scene", self.settings.scene, "--steps", self.settings.steps, "--seed", self.settings.seed)
         observation = ("--observation", "map")
-        target = ("--out", model, "--recording", recording, "--run-name", "demo-training")
+        target = ("--out", model, "--recording", recording, "--experiment", EXPERIMENT, "--run-name", "demo-training")
         line = ("python", os.path.relpath(Path(__file__).with_name("train.py")), *options, *observation, *target)
         self.run("train a policy", *line, fresh=[model, recording])
         return model
@@ -102,22 +102,36 @@ class Demo:
         policy = ("--policy", model, "--stochastic") if method == "learned" else ("--policy", method)
         size = ("--width", self.settings.width, "--height", self.settings.height)
         options = ("--scene", self.settings.scene, "--seed", self.settings.seed, *size, "--out", out)
+        options += ("--experiment", EXPERIMENT)
         self.run(f"collect {method}", "python", "-m", "avp_habitat.collect", *policy, *options, fresh=[out])
         return out
 
-    def reconstruct(self, method: str, rollout: Path) -> Path:
-        """A reconstruction with equal settings for all methods, and its scores; gives ns-eval's file."""
+    def reconstruct(self, method: str, rollout: Path) -> "Reconstruction":
+        """A reconstruction with equal settings for all methods, and its scores."""
         runs, scores = self.folder / "reconstructions", self.folder / "scores" / f"{method}.json"
         name = ("--output-dir", runs, "--experiment-name", method, "--timestamp", "demo")
         length = ("--max-num-iterations", self.settings.iterations)
-        # The comparison below is what goes to MLflow, as children of one run.
-        line = ("ns-train", "avp-nerfacto", "--data", rollout, *name, *length, "--mlflow", "off")
+        line = ("ns-train", "avp-nerfacto", "--data", rollout, *name, *length)
         self.run(f"reconstruct {method}", *line, fresh=[runs / method])
         config = runs / method / "avp-nerfacto" / "demo" / "config.yml"
         scores.parent.mkdir(exist_ok=True)
         line = ("ns-eval", "--load-config", config, "--output-path", scores)
         self.run(f"score {method}", *line, fresh=[scores])
-        return scores
+        return Reconstruction(config, scores)
+
+    def compare(self) -> None:
+        """One MLflow run that compares what the experiment holds."""
+        self.run("compare in MLflow", "python", "-m", "avp_habitat.tracking.compare", "--experiment", EXPERIMENT)
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What a reconstruction left behind."""
+
+    config: Path
+    """nerfstudio's `config.yml`."""
+    scores: Path
+    """ns-eval's file."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +141,8 @@ class Row:
     method: str
     metrics: dict[str, float]
     """By the names used in MLflow; a score that was not computed is missing."""
-    policy_run: str | None
-    """MLflow run in which the policy was trained."""
+    run: str | None
+    """MLflow run of the reconstruction."""
 
     def cells(self) -> dict[str, str]:
         """The line as text."""
@@ -148,17 +162,18 @@ class Row:
         return {"method": self.method, **texts}
 
 
-def read_row(method: str, rollout: Path, scores: Path) -> tuple[Row, str | None]:
+def read_row(method: str, rollout: Path, reconstruction: Reconstruction) -> tuple[Row, str | None]:
     """A method's figures from its rollout and ns-eval's file; and why LPIPS is missing, if it is."""
     from avp_nerfstudio.scores import read_scores
+    from avp_nerfstudio.tracking_mlflow import remembered_id
 
     meta = read_rollout(rollout).meta
-    found = read_scores(scores)
+    found = read_scores(reconstruction.scores)
     metrics = {f"eval/{name}": meta["metrics"][name] for name in ("views", "coverage", "annd_m", "ei", "path_length_m")}
     metrics |= {"eval/psnr": found.psnr, "eval/ssim": found.ssim}
     if found.lpips is not None:
         metrics["eval/lpips"] = found.lpips
-    return Row(method, metrics, meta["mlflow_run_id"]), found.lpips_reason
+    return Row(method, metrics, remembered_id(reconstruction.config.parent)), found.lpips_reason
 
 
 def write_table(folder: Path, rows: Sequence[Row], settings: Settings) -> str:
@@ -187,23 +202,21 @@ def write_table(folder: Path, rows: Sequence[Row], settings: Settings) -> str:
 
 
 def track(demo: Demo, rows: Sequence[Row]) -> None:
-    """One MLflow run with the table, and below it one run per method."""
-    import mlflow
+    """Scores for the reconstructions' MLflow runs, which lie below those of their rollouts; then the comparison."""
+    from avp_habitat.tracking.addresses import connect
+    from avp_habitat.tracking.opening import join_run
+    from avp_habitat.tracking.remote import find_run
 
-    mlflow.set_tracking_uri(_TRACKING_URI)
-    mlflow.set_experiment(EXPERIMENT)
-    with mlflow.start_run(run_name="comparison"):
-        mlflow.log_params(asdict(demo.settings))
-        lines = [row.cells() for row in rows]
-        mlflow.log_table({title: [line[title] for line in lines] for title in lines[0]}, "comparison.json")
-        mlflow.log_artifact(str(demo.folder / "table.md"))
-        for row in rows:
-            with mlflow.start_run(run_name=row.method, nested=True):
-                mlflow.log_param("method", row.method)
-                mlflow.log_metrics(row.metrics)
-                mlflow.log_artifact(str(demo.folder / "rollouts" / row.method / "trajectory.png"))
-                if row.policy_run:
-                    mlflow.set_tag("avp.policy_run", row.policy_run)
+    client = connect(_TRACKING_URI)
+    for row in rows:
+        known = find_run(client, row.run)
+        if known is None or "eval/psnr" in known.data.metrics:
+            continue
+        run = join_run(_TRACKING_URI, known.info.run_id)
+        scores = {name: value for name, value in row.metrics.items() if name not in known.data.metrics}
+        run.metrics(scores, demo.settings.iterations - 1)
+        run.close("FINISHED")
+    demo.compare()
 
 
 def record(demo: Demo, rollouts: Sequence[Path]) -> Path:
@@ -250,8 +263,8 @@ def main(argv: Sequence[str]) -> None:
     demo = _open(argv)
     model = demo.train()
     rollouts = {method: demo.collect(method, model) for method in METHODS}
-    scores = {method: demo.reconstruct(method, rollouts[method]) for method in METHODS}
-    found = [read_row(method, rollouts[method], scores[method]) for method in METHODS]
+    reconstructions = {method: demo.reconstruct(method, rollouts[method]) for method in METHODS}
+    found = [read_row(method, rollouts[method], reconstructions[method]) for method in METHODS]
     rows = [row for row, _ in found]
     table = write_table(demo.folder, rows, demo.settings)
     track(demo, rows)

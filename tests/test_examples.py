@@ -151,7 +151,7 @@ def test_the_demo_compares_three_methods_and_is_not_repeated(tmp_path):
 
     again = run("demo.py", *words, folder=tmp_path)
     assert again.returncode == 0
-    assert again.stdout.count("done before") == 10
+    assert again.stdout.count("done before") == 11
     other = run("demo.py", "--out", "d", "--steps", 4096, folder=tmp_path)
     assert other.returncode == 2
     assert "holds a demo with other settings" in other.stderr
