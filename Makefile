@@ -1,6 +1,8 @@
 # Every target sets up what it needs first; a second run starts in seconds.
 BIN := .venv/bin
 SOURCES := avp_habitat avp_sb3 avp_nerfstudio examples benchmarks scripts tests
+# One process of tests per core; the tests of a file stay together, because they share what they have made.
+PARALLEL := --numprocesses auto --dist loadfile
 
 .PHONY: help setup demo test test-all check lint format clean
 
@@ -19,7 +21,7 @@ demo: setup
 	@$(BIN)/python examples/demo.py
 
 test: setup
-	$(BIN)/python -m pytest -m "not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PARALLEL) -m "not slow"
 
 test-all: setup
 	$(BIN)/python -m pytest

@@ -58,6 +58,7 @@ fi
 rm -f "$stamp"
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --constraint constraints.txt uv
 say "installing the pinned packages (about 9 GB with torch's CUDA libraries; a minute or more)"
-"$venv/bin/uv" pip install --quiet --python "$venv/bin/python" --constraint constraints.txt --editable '.[dev]'
+# Compiled now, because with PYTHONDONTWRITEBYTECODE set every program would compile torch and MLflow anew.
+"$venv/bin/uv" pip install --quiet --compile-bytecode --python "$venv/bin/python" --constraint constraints.txt --editable '.[dev]'
 printf '%s' "$wanted" > "$stamp"
 say "ready: $venv"

@@ -29,7 +29,11 @@ def test_a_training_in_a_furnished_room_feeds_all_trackers(env, tmp_path, monkey
     assert 0 < run.data.metrics["avp/coverage"] <= 1
     assert run.data.metrics["avp/views"] == 20
     assert run.data.metrics["avp/cpv"] == pytest.approx(100 * run.data.metrics["avp/coverage"] / 20)
-    assert {file.path for file in client.list_artifacts(run.info.run_id)} == {"model.zip", "trajectory.png"}
+    assert {file.path for file in client.list_artifacts(run.info.run_id)} == {
+        "model.zip",
+        "params.json",
+        "trajectory.png",
+    }
     model = PPO.load(client.download_artifacts(run.info.run_id, "model.zip", str(tmp_path)), device="cpu")
     action, _ = model.predict(env.reset(seed=0)[0])
     assert env.action_space.contains(action)
