@@ -14,12 +14,14 @@ import numpy as np
 
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.metrics import coverage_per_view
+from avp_habitat.provenance import git_commit
 from avp_habitat.versions import installed_versions
 from avp_sb3.evaluation import PolicyResult
 from avp_sb3.evaluation_statistics import CONFIDENCE, mean_and_half_width
 
 JSON_FILE, CSV_FILE, TABLE_FILE, PLOT_FILE = "evaluation.json", "episodes.csv", "table.md", "coverage.png"
 FORMAT, FORMAT_VERSION = "avp-evaluation", 1
+_VERSIONED = ("avp-suite", "stable-baselines3", "torch", "gymnasium", "numpy", "open3d", "scipy")
 _MACHINE = f"{platform.machine()}, {os.cpu_count()} cores"
 
 
@@ -155,10 +157,6 @@ def _number(value: Any) -> float | None:
 
 
 def _json(results: Sequence[PolicyResult], about: Mapping[str, Any]) -> str:
-    # Late: it imports torch, and a mistyped option should answer at once.
-    from avp_habitat.provenance import git_commit
-    from avp_sb3.run_facts import PACKAGES
-
     value = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -166,7 +164,7 @@ def _json(results: Sequence[PolicyResult], about: Mapping[str, Any]) -> str:
         "confidence": CONFIDENCE,
         "commit": git_commit(),
         "machine": _MACHINE,
-        "versions": installed_versions((*PACKAGES, "scipy")),
+        "versions": installed_versions(_VERSIONED),
         "policies": [_entry(result) for result in results],
     }
     return json.dumps(value, indent=2, allow_nan=False) + "\n"

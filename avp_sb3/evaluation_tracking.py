@@ -15,14 +15,13 @@ from mlflow.exceptions import MlflowException
 from mlflow.tracking.context.registry import resolve_tags
 from numpy.typing import NDArray
 
-from avp_habitat.provenance import flat, git_commit
+from avp_habitat.provenance import flat
 from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, TrackingError, connect, experiment_id, first_line, shown
 from avp_habitat.tracking.names import safe_name
 from avp_habitat.tracking.view import COLOUR_TAG, NOTE_TAG, prepare_experiment, run_colour
 from avp_sb3.evaluation import PolicyResult
 from avp_sb3.evaluation_report import PLOT_FILE, ReportError, cells, cpv, summary
 from avp_sb3.evaluation_statistics import mean_and_half_width
-from avp_sb3.run_facts import version_tags
 
 TABLE = "policies.json"
 """Artifact of the upper run that MLflow's page shows as a table."""
@@ -113,9 +112,7 @@ def _own_params(result: PolicyResult, about: Mapping[str, Any]) -> list[Param]:
 
 
 def _tags(about: Mapping[str, Any]) -> dict[str, str]:
-    tags = dict(resolve_tags()) | version_tags() | {KIND_TAG: KIND}
-    if (commit := git_commit()) is not None:
-        tags["mlflow.source.git.commit"] = commit
+    tags = dict(resolve_tags()) | {KIND_TAG: KIND}
     scene = about.get("scene")
     if isinstance(scene, Mapping):
         named = {"avp.scene": scene.get("name"), "avp.scene_digest": scene.get("sha256")}

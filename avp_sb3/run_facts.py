@@ -1,4 +1,4 @@
-"""What is worth knowing about a training before it starts: hyper-parameters, task settings, versions, git commit."""
+"""What is worth knowing about a training before it starts: hyper-parameters, task settings, scenes."""
 
 import dataclasses
 import inspect
@@ -9,9 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from avp_habitat.provenance import flat
-from avp_habitat.versions import installed_versions
 
-PACKAGES = ("avp-suite", "stable-baselines3", "torch", "gymnasium", "numpy", "open3d", "mlflow")
 _NOT_HYPERPARAMETERS = {"self", "env", "policy", "verbose", "tensorboard_log", "_init_setup_model"}
 
 
@@ -51,11 +49,6 @@ def scene_tags(env: VecEnv) -> dict[str, str]:
         if env.has_attr(attribute):
             tags[tag] = ", ".join(dict.fromkeys(map(str, env.get_attr(attribute))))
     return tags
-
-
-def version_tags() -> dict[str, str]:
-    """`version.PACKAGE` of Python and the packages that shape a training; packages that are absent are left out."""
-    return {f"version.{name}": version for name, version in installed_versions(PACKAGES).items()}
 
 
 def _plain(value: Any) -> Any:

@@ -9,6 +9,7 @@ from typing import Any
 from avp_habitat.errors import RolloutError
 from avp_habitat.provenance import flat
 from avp_habitat.tracking.names import safe_name
+from avp_habitat.tracking.view import COLOUR_TAG, run_colour
 
 ROLLOUT_ID_TAG, ROLLOUT_TAG, ROLLOUT_RUN_TAG = "avp.rollout_id", "avp.rollout", "avp.rollout_run"
 POLICY_TAG, POLICY_RUN_TAG, SCENE_TAG, KIND_TAG = "avp.policy", "avp.policy_run", "avp.scene", "avp.kind"
@@ -49,7 +50,9 @@ def origin(meta: Mapping[str, Any]) -> dict[str, str]:
         meta: `rollout.json`.
     """
     leaves = flat({key: meta[key] for key in ("scene", "policy", "simulator") if isinstance(meta.get(key), Mapping)})
-    return {tag: str(leaves[key]) for tag, key in _ORIGIN.items() if leaves.get(key) is not None}
+    tags = {tag: str(leaves[key]) for tag, key in _ORIGIN.items() if leaves.get(key) is not None}
+    # One colour per policy on all of the experiment's pages.
+    return tags | ({COLOUR_TAG: run_colour(str(leaves["policy.name"]))} if leaves.get("policy.name") else {})
 
 
 def rollout_params(meta: Mapping[str, Any]) -> dict[str, str]:
