@@ -10,21 +10,18 @@ from typing import Any
 import rerun as rr
 from stable_baselines3.common.callbacks import BaseCallback
 
-from avp_habitat.errors import AVPError, UsageError
+from avp_habitat.errors import UsageError
 from avp_sb3.finished_episodes import finished_episodes, required
 from avp_sb3.rerun_environment import RecordedEnvironments
-from avp_sb3.rerun_episode import episode_of, log_episode
+from avp_sb3.rerun_episode import log_episode
 from avp_sb3.rerun_figures import EpisodeFigures
-from avp_sb3.rerun_file import RecordingFile
+from avp_sb3.rerun_file import RecordingFile, new_recording_file
 from avp_sb3.rerun_layout import blueprint, eye_above
 from avp_sb3.rerun_live import LiveViewer
 from avp_sb3.rerun_room import log_room
+from avp_sb3.rerun_trajectory import episode_of
 
 DEFAULT_FOLDER = Path("runs")
-
-
-class RecordingError(AVPError):
-    """A recording that cannot be written."""
 
 
 class RerunCallback(BaseCallback):
@@ -111,7 +108,7 @@ class RerunCallback(BaseCallback):
         self._roots = {name: _root(name) if len(names) > 1 else "" for name in names}
         areas = self._environments.areas
         self._eyes = {self._roots[name]: eye_above(area.centres) for name, area in areas.items()}
-        self._file = self._new_file(self._next_path())
+        self._file = new_recording_file(self._next_path(), self._blueprint())
         self.path = self._file.path
         # An interrupted training has no end that would finish the file.
         atexit.register(self._finish)
@@ -247,15 +244,6 @@ class RerunCallback(BaseCallback):
         if self._trainings > 1 and self._wanted_path is not None:
             path = path.with_stem(f"{path.stem}-{self._trainings}")
         return path
-
-    def _new_file(self, path: Path) -> RecordingFile:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if path.exists() or path.is_symlink():
-                raise UsageError(f"{path}: exists already; choose another name or remove it")
-            return RecordingFile(path, self._blueprint())
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot write the recording there: {error.strerror or error}") from None
 
 
 def _root(scene: str) -> str:

@@ -12,8 +12,7 @@ x axis).
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
 
 import numpy as np
 import rerun as rr
@@ -21,12 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from avp_habitat import images
-from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics
-
-if TYPE_CHECKING:
-    from avp_habitat.navigation.area import NavigableArea
-    from avp_habitat.trajectory import Trajectory
 
 _UNSEEN_COLOUR, _SEEN_COLOUR = 0xAEB4C0FF, 0x35B779FF
 _PATH_COLOUR, _VIEW_COLOUR, _AGENT_COLOUR = (178, 34, 52), (228, 120, 51, 120), (40, 40, 44)
@@ -76,35 +70,6 @@ class Episode:
     """`(m,)` step (from 1) whose view first observed each cell; 0 for never."""
     cell_m: float = 0.1
     """Side of a cell in metres."""
-
-
-def episode_of(
-    trajectory: "Trajectory",
-    area: "NavigableArea | None",
-    intrinsics: Intrinsics,
-    views: Mapping[int, EncodedView],
-) -> Episode:
-    """The episode of an environment; without its area no floor is shown.
-
-    Raises:
-        UsageError: the trajectory belongs to another scene than the area.
-    """
-    if area is not None and len(trajectory.first_seen) != len(area.centres):
-        raise UsageError(
-            f"the trajectory knows {len(trajectory.first_seen)} navigable cells, the environment's area "
-            f"{len(area.centres)}: they belong to different scenes"
-        )
-    parts = {f"reward/{name}": values for name, values in trajectory.reward_parts.items()}
-    episode = Episode(
-        camera_to_world=trajectory.camera_to_world,
-        path=np.concatenate([trajectory.start[None], trajectory.position]),
-        intrinsics=intrinsics,
-        views=views,
-        plots={"coverage": trajectory.coverage, "action": trajectory.action, "reward/sum": trajectory.reward, **parts},
-    )
-    if area is None:
-        return episode
-    return replace(episode, cells=np.asarray(area.centres), first_seen=trajectory.first_seen, cell_m=area.cell_m)
 
 
 def encode_view(rgb: NDArray[np.uint8], depth: NDArray[np.floating]) -> EncodedView:

@@ -13,11 +13,16 @@ from uuid import uuid4
 import rerun as rr
 import rerun.blueprint as rrb
 
+from avp_habitat.errors import AVPError, UsageError
 from avp_sb3.rerun_layout import APPLICATION
 
 _FILE_HEADER, _MESSAGE_HEADER, _END_OF_MESSAGES = 12, struct.Struct("<QQ"), 0
 _PIPE_BYTES, _FLUSH_S = 1 << 20, 5.0
 _CONTENTS_BYTES = 160
+
+
+class RecordingError(AVPError):
+    """A recording that cannot be written."""
 
 
 class RecordingFile:
@@ -66,10 +71,12 @@ class RecordingFile:
             time.sleep(0.001)
 
     def close(self) -> None:
-        """Finish the file; a second call does nothing."""
+        """Finish the file, after which there is no `recording`; a second call does nothing."""
         if self._file.closed:
             return
         self.recording.disconnect()
+        # Rerun frees it now, not while the interpreter is being taken down and its threads can wait for ever.
+        del self.recording
         self._thread.join()
         self._file.close()
 
@@ -107,6 +114,22 @@ class RecordingFile:
             self.fault = error
             os.ftruncate(self._file.fileno(), self._written)
         del self._pending[:count]
+
+
+def new_recording_file(path: Path, blueprint: rrb.Blueprint) -> RecordingFile:
+    """A recording in a file that did not exist, in a folder that is made if need be.
+
+    Raises:
+        UsageError: the file exists.
+        RecordingError: it cannot be made.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists() or path.is_symlink():
+            raise UsageError(f"{path}: exists already; choose another name or remove it")
+        return RecordingFile(path, blueprint)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot write the recording there: {error.strerror or error}") from None
 
 
 def _whole_messages(data: bytearray) -> tuple[int, int]:

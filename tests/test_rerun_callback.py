@@ -1,4 +1,7 @@
+import errno
 import io
+import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,8 +24,9 @@ from avp_habitat.images import DEPTH_UNIT_M
 from avp_habitat.poses import Intrinsics
 from avp_sb3 import RerunCallback
 from avp_sb3.finished_episodes import MissingInfoError
-from avp_sb3.rerun_callback import RecordingError
 from avp_sb3.rerun_episode import Episode, log_episode, spread_indices
+from avp_sb3.rerun_file import RecordingError, RecordingFile
+from avp_sb3.rerun_layout import blueprint
 
 
 class Notes(BaseCallback):
@@ -298,7 +302,9 @@ def test_environments_without_figures_are_recorded_without_curves(tmp_path, caps
 
 
 class OtherScene(SmallEnv):
-    scene_name = "other (2)"
+    @property
+    def scene_name(self):
+        return "other (2)"
 
 
 def test_each_of_several_scenes_has_its_own_room(tmp_path):
@@ -313,6 +319,71 @@ def test_each_of_several_scenes_has_its_own_room(tmp_path):
     numbers = [{time for time, _ in rows(path, f"{name}/plots/coverage", "Scalars:scalars")} for name in names]
     assert not numbers[0] & numbers[1]
     assert sorted(numbers[0] | numbers[1]) == list(range(len(numbers[0] | numbers[1])))
+
+
+class After90Steps(BaseCallback):
+    def __init__(self, action):
+        super().__init__()
+        self.action = action
+
+    def _on_step(self):
+        if self.n_calls == 90:
+            self.action()
+        return True
+
+
+def recorder(path):
+    return RerunCallback(path, every=1, max_share=1, pictures=1, width=32, height=24)
+
+
+def recorded_episodes(path, entity="/plots/coverage"):
+    return {time for time, _ in rows(path, entity, "Scalars:scalars", "episode")}
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_during_a_training_the_file_has_the_episodes_before(tmp_path):
+    path, copy = tmp_path / "a.rrd", tmp_path / "copy.rrd"
+    ppo().learn(128, callback=[recorder(path), After90Steps(lambda: shutil.copy(path, copy))])
+    numbers = recorded_episodes(copy)
+    # 90 steps are eleven episodes of at most 8 steps, all of them recorded.
+    assert numbers == set(range(1, len(numbers) + 1))
+    assert 11 <= len(numbers) < len(recorded_episodes(path))
+
+
+def test_an_interrupted_training_is_finished_by_closing_the_callback(tmp_path):
+    path = tmp_path / "a.rrd"
+    callback = recorder(path)
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ppo().learn(128, callback=[callback, After90Steps(interrupt)])
+    callback.close()
+    verify(path)
+    assert recorded_episodes(path) == recorded_episodes(path, "/metrics/coverage") != set()
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_a_write_that_fails_ends_the_file_before_it(tmp_path):
+    file = RecordingFile(tmp_path / "a.rrd", blueprint([""]))
+    file.recording.log("before", rr.Scalars(1))
+    file.flush()
+    size = file.path.stat().st_size
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # The next message is begun, and not ended.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size + 100, hard))
+    try:
+        file.recording.log("after", rr.Points3D(np.zeros((1000, 3))))
+        file.flush()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    file.recording.log("after", rr.Scalars(2))
+    file.close()
+    assert file.fault is not None
+    assert file.fault.errno == errno.EFBIG
+    assert file.path.stat().st_size == size
+    assert entities(file.path) == {"/before"}
 
 
 def run_training(path, how):
@@ -345,6 +416,7 @@ print("done")
 """
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_a_killed_training_leaves_a_file_with_the_episodes_before(tmp_path):
     path = tmp_path / "a.rrd"
@@ -358,6 +430,7 @@ def test_a_killed_training_leaves_a_file_with_the_episodes_before(tmp_path):
     assert len(steps) > 90 - 8
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_leaves_a_whole_file(tmp_path):
     path = tmp_path / "a.rrd"
     assert "KeyboardInterrupt" in run_training(path, "Ctrl-C").stderr
@@ -369,6 +442,7 @@ def test_an_interrupted_training_leaves_a_whole_file(tmp_path):
     assert episodes[0] == episodes[1] != set()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_a_full_disk_ends_the_recording_and_not_the_training(tmp_path):
     path = tmp_path / "a.rrd"
