@@ -3,6 +3,7 @@
 The standard input is the leash: it ends when the other process closes it or dies, even by SIGKILL.
 """
 
+import os
 import subprocess
 import sys
 import threading
@@ -14,7 +15,9 @@ def main(arguments: Sequence[str]) -> int:
     child = subprocess.Popen(arguments, stdin=subprocess.DEVNULL)
 
     def wait_for_the_end_of_the_leash() -> None:
-        sys.stdin.buffer.read()
+        # Without a buffer, whose lock Python would want when the program ends first and this still waits.
+        while os.read(sys.stdin.fileno(), 1024):
+            pass
         child.kill()
 
     threading.Thread(target=wait_for_the_end_of_the_leash, daemon=True).start()
