@@ -57,6 +57,7 @@ class EvaluationCallback(BaseCallback):
         episodes: int = DEFAULT_EPISODES,
         seed: int = 1000,
         deterministic: bool = False,
+        at_start: bool = True,
         score: str = "return",
         best_model: str | Path | None = f"runs/best-{WHEN}.zip",
         settings: TaskSettings | None = None,
@@ -76,6 +77,7 @@ class EvaluationCallback(BaseCallback):
                 environments than episodes has this only for the first ones; the others follow from them.
             deterministic: take the likeliest actions. False samples them, which is the fairer test of a policy that
                 trains with sampled ones (docs/training.md), with the same random numbers each time.
+            at_start: evaluate before the first step, too, which also prepares the tables of the scenes.
             score: the figure by which the best model is chosen: `return` or another one of those logged. The least is
                 best for views, path_length_m, collisions and redundant_share, the greatest for all others.
             best_model: file of the best model; `DATE-TIME` in its name becomes when the training started; None keeps
@@ -97,7 +99,7 @@ class EvaluationCallback(BaseCallback):
         self._given, self._env = eval_env, eval_env
         self._agents: dict[str, list[int]] = {}
         self._every, self._episodes, self._seed = every, episodes, seed
-        self._deterministic, self._score = deterministic, score
+        self._deterministic, self._at_start, self._score = deterministic, at_start, score
         self._settings, self._simulator = settings, simulator
         self._best = BestModel(best_model, score)
         self._due = 0
@@ -122,6 +124,11 @@ class EvaluationCallback(BaseCallback):
         self._evaluated_at = None
         self._plan_next()
         move_to_front(self, self.locals.get("callback"))
+
+    def _on_rollout_start(self) -> None:
+        # Not when the training starts: trackers that come later in the list are not listening yet.
+        if self._at_start and self._evaluated_at is None:
+            self._evaluate()
 
     def _on_step(self) -> bool:
         # The last evaluation comes after the last update; one within the last rollout would be the same but worse.

@@ -70,7 +70,7 @@ def evaluated(steps=256, env=None, *, model=None, others=(), **options):
     """Train a little with an evaluation, and what was dumped."""
     if "eval_env" not in options:
         options["eval_env"] = corridors()
-    callback = EvaluationCallback(**{"every": 100, "episodes": 4, "best_model": None, **options})
+    callback = EvaluationCallback(**{"every": 100, "episodes": 4, "best_model": None, "at_start": False, **options})
     model = model or ppo(env)
     dumps = Dumps()
     model.set_logger(Logger(None, [dumps]))
@@ -153,6 +153,14 @@ def test_steps_of_all_agents_count_and_the_end_is_evaluated_once(agents):
     assert model.num_timesteps == 384
 
 
+def test_the_model_is_evaluated_before_its_first_step_too(tmp_path, monkeypatch):
+    client, tracker = MlflowClient(mlflow_home(tmp_path, monkeypatch)), MLflowCallback(log_model=False)
+    callback = EvaluationCallback(eval_env=corridors(), every=100, best_model=None)
+    ppo().learn(128, callback=[callback, tracker])
+    steps = [point.step for point in client.get_metric_history(tracker.run_id, "eval/coverage")]
+    assert steps == [0, 100, 128]
+
+
 def test_an_evaluation_due_in_the_last_rollout_is_left_to_the_end():
     _, dumps, _ = evaluated(200, every=200)
     assert [step for step, _ in dumps.evaluations()] == [256]
@@ -161,7 +169,7 @@ def test_an_evaluation_due_in_the_last_rollout_is_left_to_the_end():
 def test_a_resumed_training_goes_on_with_the_same_steps():
     model = ppo()
     evaluated(128, model=model, every=1000)
-    callback, dumps = EvaluationCallback(eval_env=corridors(), every=100, best_model=None), Dumps()
+    callback, dumps = EvaluationCallback(eval_env=corridors(), at_start=False, every=100, best_model=None), Dumps()
     model.set_logger(Logger(None, [dumps]))
     model.learn(192, callback=callback, reset_num_timesteps=False)
     assert [step for step, _ in dumps.evaluations()] == [200, 300, 320]
@@ -308,7 +316,11 @@ class Closing(BaseCallback):
 def test_figures_pictures_and_the_best_model_reach_mlflow_once(tmp_path, monkeypatch):
     client = MlflowClient(mlflow_home(tmp_path, monkeypatch))
     tracker = MLflowCallback()
-    callbacks = [tracker, MetricsCallback(), EvaluationCallback(eval_env=corridors(), every=100, best_model="best.zip")]
+    callbacks = [
+        tracker,
+        MetricsCallback(),
+        EvaluationCallback(eval_env=corridors(), at_start=False, every=100, best_model="best.zip"),
+    ]
     ppo().learn(192, callback=callbacks)
     run = client.get_run(tracker.run_id)
     assert run.info.status == "FINISHED"
@@ -323,7 +335,10 @@ def test_figures_pictures_and_the_best_model_reach_mlflow_once(tmp_path, monkeyp
 def test_every_format_of_the_logger_takes_an_evaluation(tmp_path):
     model = ppo()
     model.set_logger(configure(str(tmp_path), ["stdout", "log", "csv", "json", "tensorboard"]))
-    model.learn(192, callback=EvaluationCallback(eval_env=corridors(), every=100, best_model=tmp_path / "best.zip"))
+    model.learn(
+        192,
+        callback=EvaluationCallback(eval_env=corridors(), at_start=False, every=100, best_model=tmp_path / "best.zip"),
+    )
     rows = [json.loads(line) for line in (tmp_path / "progress.json").read_text().splitlines()]
     coverage = {row["time/total_timesteps"]: row["eval/coverage"] for row in rows if "eval/coverage" in row}
     assert list(coverage) == [100, 192]
@@ -340,7 +355,7 @@ def test_every_format_of_the_logger_takes_an_evaluation(tmp_path):
 @pytest.mark.parametrize("progress_bar", [False, True])
 def test_the_last_evaluation_reaches_trackers_that_stand_before_it_in_the_list(progress_bar):
     tracker = Closing()
-    callbacks = [tracker, EvaluationCallback(eval_env=corridors(), every=100, best_model=None)]
+    callbacks = [tracker, EvaluationCallback(eval_env=corridors(), at_start=False, every=100, best_model=None)]
     ppo().learn(128, callback=callbacks, progress_bar=progress_bar)
     assert [step for step, _ in tracker.dumps.evaluations()] == [100, 128]
     assert callbacks[0] is tracker
@@ -355,7 +370,7 @@ def test_an_interrupted_training_is_not_evaluated_when_rl_zoo3_cleans_up():
 
     model, dumps = ppo(), Dumps()
     model.set_logger(Logger(None, [dumps]))
-    callbacks = [EvaluationCallback(eval_env=corridors(), every=100, best_model=None), Interrupting()]
+    callbacks = [EvaluationCallback(eval_env=corridors(), at_start=False, every=100, best_model=None), Interrupting()]
     try:
         model.learn(256, callback=callbacks)
     except KeyboardInterrupt:
