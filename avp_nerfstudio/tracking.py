@@ -1,15 +1,13 @@
 """What follows a training while it runs: an MLflow run, a Rerun recording, both or neither."""
 
-import logging
 from pathlib import Path
 from typing import Any
 
 from nerfstudio.utils import writer
 
-from avp_habitat.tracking.addresses import shown
 from avp_habitat.tracking.journal import spool_folder
 from avp_habitat.tracking.looking import about_run
-from avp_habitat.tracking.recovery import Recovered, recover_in_background
+from avp_habitat.tracking.recovery import recover_in_background
 from avp_habitat.tracking.remote import OFFLINE
 from avp_habitat.tracking.run import Status, TrackedRun
 from avp_nerfstudio.tracking_events import ScalarWriter, Sink
@@ -18,7 +16,6 @@ from avp_nerfstudio.tracking_mlflow import open_run, remembered_id
 from avp_nerfstudio.tracking_rerun import ReconstructionRecording
 
 _FILES = ("config.yml", "dataparser_transforms.json")
-_log = logging.getLogger(__name__)
 
 
 class Trackers:
@@ -53,7 +50,7 @@ class Trackers:
             earlier=remembered_id(config.load_dir.parent) if config.load_dir is not None else None,
         )
         print(about_run(run.run_id, run.address, delivered=not run.run_id.startswith(OFFLINE)))
-        recover_in_background(spool_folder(), _tell_recovered)
+        recover_in_background(spool_folder())
         return cls(run, recording)
 
     def listen(self, every: int) -> None:
@@ -86,11 +83,6 @@ class Trackers:
                     run.file(path)
             delivered = run.close(status)
             print(about_run(run.run_id, run.address, delivered=delivered))
-
-
-def _tell_recovered(recovered: Recovered) -> None:
-    state = ("closed as KILLED" if recovered.killed else "completed") if recovered.delivered else "still not sent"
-    _log.warning("MLflow run %s of an earlier program, at %s: %s", recovered.run_id, shown(recovered.address), state)
 
 
 def start_recording(path: Path, pipeline: Any) -> ReconstructionRecording:

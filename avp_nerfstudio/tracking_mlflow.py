@@ -9,15 +9,9 @@ from typing import TYPE_CHECKING
 from avp_habitat.tracking.addresses import DEFAULT_EXPERIMENT, TrackingError
 from avp_habitat.tracking.early import open_store
 from avp_habitat.tracking.journal import Journal, spool_folder
-from avp_habitat.tracking.opening import (
-    NewRun,
-    continue_run,
-    join_run,
-    may_continue,
-    start_run,
-)
+from avp_habitat.tracking.opening import NewRun, continue_run, join_run, journal_of, may_continue, start_run
 from avp_habitat.tracking.recovery import finish
-from avp_habitat.tracking.remote import OFFLINE, find_run
+from avp_habitat.tracking.remote import find_run
 from avp_habitat.tracking.rollout_facts import POLICY_RUN_TAG, ROLLOUT_RUN_TAG
 from avp_habitat.tracking.rollout_run import rollout_run
 from avp_habitat.tracking.run import TrackedRun
@@ -114,12 +108,10 @@ def _again(client: "MlflowClient | None", address: str, run_id: str) -> TrackedR
 
 def _deliver_left(run_id: str) -> None:
     """Send what a run could not send while it lasted, and close it if its program was killed."""
-    for folder in sorted(spool_folder().glob("*")):
-        header = Journal.peek(folder)
-        if header is not None and run_id in (header["run_id"], f"{OFFLINE}{header['key']}"):
-            journal = Journal.adopt(folder)
-            if journal is not None:
-                finish(journal)
+    folder = journal_of(spool_folder(), run_id)
+    journal = None if folder is None else Journal.adopt(folder)
+    if journal is not None:
+        finish(journal)
 
 
 def _new(address: str, facts: Facts, experiment: str | None, tags: Mapping[str, str]) -> TrackedRun:

@@ -18,7 +18,7 @@ from avp_habitat.provenance import flat
 from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, DEFAULT_EXPERIMENT, shown
 from avp_habitat.tracking.journal import spool_folder
 from avp_habitat.tracking.opening import NewRun, continue_run, join_run, may_continue, start_run
-from avp_habitat.tracking.recovery import Recovered, recover_in_background
+from avp_habitat.tracking.recovery import recover_in_background
 from avp_habitat.tracking.run import Status, TrackedRun
 from avp_sb3.finished_episodes import finished_episodes
 from avp_sb3.learning import is_learning
@@ -66,7 +66,7 @@ class MLflowCallback(BaseCallback):
         *,
         run_id: str | None = None,
         log_model: bool = True,
-        checkpoint_s: float = 60.0,
+        checkpoint_s: float = 30.0,
         offline: bool | None = None,
         params: Mapping[str, Any] | None = None,
         tags: Mapping[str, str] | None = None,
@@ -153,7 +153,7 @@ class MLflowCallback(BaseCallback):
         self._writer = MLflowWriter(run)
         self.logger.output_formats.append(self._writer)
         self._saved_at = time.monotonic()
-        recovery = recover_in_background(spool_folder(), _tell_recovered)
+        recovery = recover_in_background(spool_folder())
         # The usual case, a store on this machine, is a matter of milliseconds; a slow server is not waited for.
         recovery.join(0.5)
         if self.verbose:
@@ -246,9 +246,3 @@ class MLflowCallback(BaseCallback):
 def _status_of(error: BaseException | None) -> Status:
     interrupted = error is None or isinstance(error, (KeyboardInterrupt, SystemExit))
     return "KILLED" if interrupted else "FAILED"
-
-
-def _tell_recovered(result: Recovered) -> None:
-    what = "closed as KILLED" if result.killed else "completed"
-    state = what if result.delivered else "still not sent"
-    _log.warning("MLflow run %s of an earlier program, at %s: %s", result.run_id, shown(result.address), state)

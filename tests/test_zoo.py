@@ -263,12 +263,15 @@ def test_the_evaluation_is_added_by_the_documented_option(home):
 @pytest.mark.slow
 def test_an_interrupted_training_keeps_its_model_and_its_run(home):
     process = subprocess.Popen(line("train", *TRAIN), cwd=home, stdout=subprocess.PIPE, text=True)
-    for text in process.stdout:
-        if "total_timesteps" in text:
-            break
-    time.sleep(0.2)
-    os.kill(process.pid, signal.SIGINT)
-    process.communicate(timeout=120)
+    try:
+        for text in process.stdout:
+            if "total_timesteps" in text:
+                break
+        time.sleep(0.2)
+        os.kill(process.pid, signal.SIGINT)
+        process.communicate(timeout=120)
+    finally:
+        process.kill()
     model = PPO.load(home / "logs/ppo/AVP-v0_1/AVP-v0.zip", device="cpu")
     assert 0 < model.num_timesteps < 300_000
     assert MlflowClient().get_run(model.avp_mlflow_run_id).info.status == "KILLED"

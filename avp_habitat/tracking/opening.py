@@ -126,15 +126,23 @@ def may_continue(address: str, run_id: str, *, spool: Path | None = None) -> boo
     A run that MLflow takes for running, and of which this machine has no journal, may be running elsewhere.
     """
     home = spool or spool_folder()
-    for folder in home.glob("*"):
-        header = Journal.peek(folder)
-        if header is not None and run_id in (header["run_id"], f"{OFFLINE}{header['key']}"):
-            return header["ended"] != "FINISHED" and not Journal.in_use(folder)
+    folder = journal_of(home, run_id)
+    if folder is not None and (header := Journal.peek(folder)) is not None:
+        return header["ended"] != "FINISHED" and not Journal.in_use(folder)
     try:
         run = find_run(connect(address), run_id)
     except TrackingError:
         return False
     return run is not None and run.info.status in ("KILLED", "FAILED")
+
+
+def journal_of(spool: Path, run_id: str) -> Path | None:
+    """The folder of the journal of a run, in use or left; None when there is none."""
+    for folder in sorted(spool.glob("*")):
+        header = Journal.peek(folder)
+        if header is not None and run_id in (header["run_id"], f"{OFFLINE}{header['key']}"):
+            return folder
+    return None
 
 
 def join_run(address: str, run_id: str, *, spool: Path | None = None, **options: Any) -> TrackedRun:
@@ -191,12 +199,10 @@ def _left_journal(spool: Path, run_id: str) -> Journal | None:
     Raises:
         TrackingError: it is in use.
     """
-    for folder in sorted(spool.glob("*")):
-        header = Journal.peek(folder)
-        if header is None or run_id not in (header["run_id"], f"{OFFLINE}{header['key']}"):
-            continue
-        journal = Journal.adopt(folder)
-        if journal is None:
-            raise TrackingError(f"MLflow run {run_id}: another program is writing it ({folder})")
-        return journal
-    return None
+    folder = journal_of(spool, run_id)
+    if folder is None:
+        return None
+    journal = Journal.adopt(folder)
+    if journal is None:
+        raise TrackingError(f"MLflow run {run_id}: another program is writing it ({folder})")
+    return journal

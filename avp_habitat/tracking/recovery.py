@@ -1,5 +1,6 @@
 """Runs whose process is gone: what they still had to say is sent, and they are closed."""
 
+import logging
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -7,8 +8,11 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from avp_habitat.tracking.addresses import shown
 from avp_habitat.tracking.journal import Journal
 from avp_habitat.tracking.run import TrackedRun
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -71,13 +75,19 @@ def recover(spool: Path, *, timeout_s: float = 30.0, on_each: Callable[[Recovere
         on_each(finish(journal, timeout_s=timeout_s))
 
 
-def recover_in_background(spool: Path, on_each: Callable[[Recovered], object] = lambda _: None) -> threading.Thread:
-    """`recover` without making anybody wait for a slow server."""
+def recover_in_background(spool: Path) -> threading.Thread:
+    """`recover` without making anybody wait for a slow server; a warning names each run."""
 
     def work() -> None:
         with suppress(OSError):
-            recover(spool, timeout_s=10.0, on_each=on_each)
+            recover(spool, timeout_s=10.0, on_each=_tell)
 
     thread = threading.Thread(target=work, name="avp-mlflow-recovery", daemon=True)
     thread.start()
     return thread
+
+
+def _tell(result: Recovered) -> None:
+    what = "closed as KILLED" if result.killed else "completed"
+    state = what if result.delivered else "still not sent"
+    _log.warning("MLflow run %s of an earlier program, at %s: %s", result.run_id, shown(result.address), state)
