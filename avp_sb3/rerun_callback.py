@@ -33,9 +33,8 @@ class RerunCallback(BaseCallback):
     floor, without `capture` no pictures, without both no room, without `info["avp_episode"]` no curves.
 
     An episode of 80 steps with 6 pictures of 240x180 takes about 0.2 MB, a scene 0.5 to 1 MB once, 1,000 episodes'
-    figures 0.4 MB (1 MB when five end in a second, 4 MB when one ends in two: every 10 s some are sent). `max_bytes`
-    bounds the whole file, `max_share` the time, whatever the speed of the training. When the disk is full or a viewer
-    goes away, it says so once and the training goes on.
+    figures 0.4 MB (1 MB at five episodes a second: every 10 s some are sent). `max_bytes` bounds the whole file,
+    `max_share` the time. When the disk is full or a viewer goes away, it says so once and the training goes on.
     """
 
     def __init__(
