@@ -235,3 +235,32 @@ def test_addresses_are_shown_without_passwords():
     assert shown("https://me:secret@host:1/x") == "https://host:1/x"
     assert address_of("off", default="sqlite:///a.db") is None
     assert Journal.peek(Path("nowhere")) is None
+
+
+FULL = """
+import resource, signal
+from pathlib import Path
+from avp_habitat.tracking.opening import NewRun, start_run
+run = start_run("sqlite:///mlflow.db", NewRun(), interval_s=0.01)
+assert run.flush()
+soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+# No file may grow beyond the database as it is: a full disk for the database, and soon for the journal.
+resource.setrlimit(resource.RLIMIT_FSIZE, (Path("mlflow.db").stat().st_size, hard))
+for step in range(4000):
+    run.metrics({f"metric/{i}": step + i for i in range(10)}, step)
+print(run.run_id, flush=True)
+assert not run.flush(60.0)
+resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+assert run.close("FINISHED")
+"""
+
+
+def test_a_full_disk_is_said_in_a_line_and_everything_arrives_when_it_takes_something_again(address):
+    process = python(FULL, stderr=subprocess.PIPE)
+    said, complaints = process.communicate(timeout=300)
+    assert process.returncode == 0, complaints
+    assert complaints.count("does not take the run's points now (") == 1
+    assert "Traceback" not in complaints
+    run_id = said.split()[0]
+    for i in (0, 9):
+        assert points(address, run_id, f"metric/{i}") == [(step, step + i) for step in range(4000)]

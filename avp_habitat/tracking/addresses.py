@@ -115,7 +115,10 @@ def first_line(error: BaseException) -> str:
     """An error's text without its tail of hints and stack frames."""
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.strerror}: {error.filename!r}"
-    return str(error).strip().partition("\n")[0] or repr(error)
+    text = str(error).strip()
+    # What a database says stands somewhere in SQLAlchemy's text: (sqlite3.OperationalError) database or disk is full
+    of_database = re.search(r"^\((?:\w+\.)+\w+\) (.+)$", text, re.MULTILINE)
+    return of_database[1] if of_database else text.partition("\n")[0] or repr(error)
 
 
 def _misunderstood(address: str, error: Exception) -> str | None:

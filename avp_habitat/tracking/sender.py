@@ -12,7 +12,8 @@ from avp_habitat.tracking.journal import Journal
 INTERVAL_S = 5.0
 """Time between two calls while a run lasts; each costs the training tens of milliseconds of Python."""
 _RETRY_S = (1.0, 15.0)
-_ASKED_AGAIN = 2
+_ASKED_AGAIN, _FAILED_AGAIN = 2, 8
+_THREAD = "avp-mlflow"
 _log = logging.getLogger(__name__)
 
 
@@ -46,15 +47,17 @@ class Sender:
         self._hurry = threading.Event()
         self._stopped = threading.Event()
         self._idle = threading.Event()
-        self._unanswered = 0
+        self._unanswered = self._failures = 0
         self.problem: str | None = None
         """Why nothing arrives just now."""
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         """Begin."""
+        # MLflow writes a hundred lines about each failure of a database; here one line says it once.
+        logging.getLogger("mlflow.store.db.utils").addFilter(_not_ours)
         # A daemon, so that an interpreter that exits without `close` is not held up; the journal keeps the rest.
-        self._thread = threading.Thread(target=self._work, name="avp-mlflow", daemon=True)
+        self._thread = threading.Thread(target=self._work, name=_THREAD, daemon=True)
         self._thread.start()
 
     def drain(self, timeout_s: float) -> bool:
@@ -82,12 +85,12 @@ class Sender:
 
     def _wait_while_it_moves(self, timeout_s: float) -> bool:
         until = time.monotonic() + timeout_s
-        calls, asked = self._calls, self._unanswered
+        calls, asked, failed = self._calls, self._unanswered, self._failures
         while not self._journal.wait(0.2, for_entries=False):
             if self._calls > calls:
                 calls = self._calls
                 until = time.monotonic() + timeout_s
-            gone = self._unanswered - asked >= _ASKED_AGAIN
+            gone = self._unanswered - asked >= _ASKED_AGAIN or self._failures - failed >= _FAILED_AGAIN
             if gone or time.monotonic() > until or not (self._thread and self._thread.is_alive()):
                 return False
         return True
@@ -105,6 +108,7 @@ class Sender:
                 self._send_some()
             except Exception as error:
                 self._uncertain = True
+                self._failures += 1
                 self._unanswered += isinstance(error, StoreUnreachableError)
                 self._failed(first_line(error))
                 self._rest(pause)
@@ -148,3 +152,7 @@ class Sender:
         if self.problem is not None:
             _log.warning("MLflow at %s takes the run's points again", shown(self._address))
         self.problem = None
+
+
+def _not_ours(record: logging.LogRecord) -> bool:
+    return record.threadName != _THREAD
