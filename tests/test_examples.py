@@ -36,7 +36,7 @@ def test_the_training_script_trains_tracks_and_saves(tmp_path):
     assert (found.info.run_name, found.info.status) == ("tiny", "FINISHED")
     assert 0 < found.data.metrics["avp/coverage"] < 1
     evaluated = client.get_metric_history(found.info.run_id, "eval/coverage")
-    assert [point.step for point in evaluated] == [1024, 2048]
+    assert [point.step for point in evaluated] == [0, 1024, 2048]
     assert "best_model.zip" in {file.path for file in client.list_artifacts(found.info.run_id)}
     assert zipfile.is_zipfile(tmp_path / "model-best.zip")
 
