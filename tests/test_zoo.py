@@ -249,7 +249,7 @@ def test_the_evaluation_is_added_by_the_documented_option(home):
     trained = subprocess.run(line("train", *words), cwd=home, capture_output=True, text=True, timeout=300)
     assert trained.returncode == 0, trained.stderr
     run = only_run()
-    assert steps_of(run, "eval/coverage") == [100, 192]
+    assert steps_of(run, "eval/coverage") == [0, 100, 192]
     assert {"eval/cpv", "eval/return", "eval/builtin_7/coverage", "eval/builtin_8/views"} <= run.data.metrics.keys()
     assert run.data.metrics["eval/coverage"] == pytest.approx(
         (run.data.metrics["eval/builtin_7/coverage"] + run.data.metrics["eval/builtin_8/coverage"]) / 2
