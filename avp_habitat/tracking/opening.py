@@ -109,13 +109,10 @@ def continue_run(
     if journal is not None:
         journal.header |= {"address": absolute(address), "continue": True, "ended": None}
         return _reopened(journal, client, uncertain=True, **options)
-    if client is None or run_id.startswith(OFFLINE):
-        if run_id.startswith(OFFLINE) and client is not None:
-            run_id = existing_run(client, run_id).info.run_id
-        elif run_id.startswith(OFFLINE):
-            raise TrackingError(f"MLflow run {run_id}: expected its journal in {home}, found none")
-    else:
+    if client is not None:
         run_id = existing_run(client, run_id).info.run_id
+    elif run_id.startswith(OFFLINE):
+        raise TrackingError(f"MLflow run {run_id}: expected its journal in {home}, found none")
     journal = Journal.create(home, _header(address) | {"run_id": run_id, "continue": True})
     return _reopened(journal, client, **options)
 
