@@ -1,10 +1,8 @@
 """How recordings of episodes are opened, and how a viewer lays them out."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
-import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
@@ -84,18 +82,6 @@ def blueprint(
     top = parts[0] if len(parts) == 1 else rrb.Tabs(*parts)
     panel = rrb.TimePanel(state="collapsed", timeline="step", fps=_STEPS_PER_SECOND)
     return rrb.Blueprint(top, panel, collapse_panels=True)
-
-
-def open_recording(path: Path, roots: Sequence[str], *, with_map: bool = False) -> rr.RecordingStream:
-    """A recording that is written to a file, with the layout of its roots; `disconnect()` finishes it.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    path.touch()  # Rerun's own error for an unwritable path has neither the path nor an errno.
-    recording = rr.RecordingStream(APPLICATION)
-    recording.save(path, default_blueprint=blueprint(roots, with_map=with_map))
-    return recording
 
 
 def _step_plots(root: str) -> rrb.Container:

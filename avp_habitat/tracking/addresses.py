@@ -1,20 +1,18 @@
 """Where MLflow keeps runs: the address that an option means, and a client of a store that answers."""
 
-import fcntl
 import hashlib
 import logging
 import os
 import re
 import socket
-import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from avp_habitat.errors import AVPError
+from avp_habitat.tracking.locks import alone
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -70,7 +68,7 @@ def connect(address: str) -> "MlflowClient":
     try:
         from mlflow import MlflowClient
 
-        with _alone(address):
+        with _one_at_a_time(address):
             client = MlflowClient(address)
             client.search_experiments(max_results=1)
     except ImportError as error:
@@ -132,19 +130,12 @@ def _misunderstood(address: str, error: Exception) -> str | None:
     return None
 
 
-@contextmanager
-def _alone(address: str) -> Iterator[None]:
-    """Keeps other processes from making the same sqlite database at the same time, which would leave it half-made."""
+def _one_at_a_time(address: str) -> AbstractContextManager[None]:
+    """Keeps other programs from making the same sqlite database at the same time, which would leave it half-made."""
     if not address.startswith(_SQLITE):
-        yield
-        return
+        return nullcontext()
     path = Path(address.removeprefix(_SQLITE)).absolute()
-    name = hashlib.sha256(os.fsencode(path)).hexdigest()[:16]
-    lock = Path(tempfile.gettempdir()) / f"avp-mlflow-{os.getuid()}-{name}.lock"
-    with lock.open("w") as file:
-        with suppress(OSError):
-            fcntl.lockf(file, fcntl.LOCK_EX)
-        yield
+    return alone(f"mlflow-{hashlib.sha256(os.fsencode(path)).hexdigest()[:16]}")
 
 
 def experiment_id(client: "MlflowClient", name: str) -> tuple[str, bool]:

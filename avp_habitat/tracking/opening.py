@@ -1,6 +1,5 @@
 """How a tracked run begins: as a new one, as one that goes on, or within one that is open already."""
 
-import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,13 +9,13 @@ from uuid import uuid4
 
 from avp_habitat.tracking.addresses import (
     DEFAULT_EXPERIMENT,
-    StoreUnreachableError,
     TrackingError,
     absolute,
     connect,
     first_line,
     shown,
 )
+from avp_habitat.tracking.early import open_store
 from avp_habitat.tracking.journal import VERSION, Journal, spool_folder
 from avp_habitat.tracking.remote import OFFLINE, create, existing_run, find_run, reopen
 from avp_habitat.tracking.run import TrackedRun
@@ -24,7 +23,7 @@ from avp_habitat.tracking.run import TrackedRun
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-OFFLINE_VARIABLE = "AVP_MLFLOW_OFFLINE"
+_OPTION = "offline=True"
 
 
 @dataclass(frozen=True)
@@ -39,11 +38,6 @@ class NewRun:
     """Beside those of MLflow's run context."""
     parent: str | None = None
     """Id of the run below which MLflow shows this one, when both lie in one experiment."""
-
-
-def wants_offline(offline: bool | None) -> bool:
-    """Whether to go on without the server: as said, else as the variable `AVP_MLFLOW_OFFLINE` says."""
-    return os.environ.get(OFFLINE_VARIABLE, "") not in ("", "0") if offline is None else offline
 
 
 def start_run(
@@ -64,7 +58,7 @@ def start_run(
     """
     from mlflow.tracking.context.registry import resolve_tags
 
-    client = _client(address, offline=wants_offline(offline))
+    client = open_store(address, offline=offline, option=_OPTION)
     header = _header(address) | {
         "experiment": new.experiment,
         "name": new.name,
@@ -104,7 +98,7 @@ def continue_run(
             written by another process.
     """
     home = spool or spool_folder()
-    client = _client(address, offline=wants_offline(offline))
+    client = open_store(address, offline=offline, option=_OPTION)
     journal = _left_journal(home, run_id)
     if journal is not None:
         journal.header |= {"address": absolute(address), "continue": True, "ended": None}
@@ -158,17 +152,6 @@ def join_run(address: str, run_id: str, *, spool: Path | None = None, **options:
     run_id = existing_run(client, run_id).info.run_id
     header = _header(address) | {"run_id": run_id, "owned": False}
     return TrackedRun(Journal.create(spool or spool_folder(), header), client, **options)
-
-
-def _client(address: str, *, offline: bool) -> "MlflowClient | None":
-    try:
-        return connect(address)
-    except StoreUnreachableError as error:
-        if offline:
-            return None
-        raise StoreUnreachableError(
-            f"{error}; to go on without it and send everything later: offline=True, or {OFFLINE_VARIABLE}=1 set"
-        ) from None
 
 
 def _reopened(journal: Journal, client: "MlflowClient | None", **options: Any) -> TrackedRun:

@@ -1,13 +1,10 @@
 """`python -m avp_habitat.tracking.rollout_run`: rollouts as MLflow runs, each below the run that trained its policy."""
 
 import argparse
-import fcntl
 import os
 import shlex
 import sys
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +24,7 @@ from avp_habitat.tracking.addresses import (
     shown,
     unreachable,
 )
+from avp_habitat.tracking.locks import alone
 from avp_habitat.tracking.looking import how_to_look
 from avp_habitat.tracking.remote import PARENT_TAG, find_run
 
@@ -59,7 +57,8 @@ def rollout_run(store: "MlflowClient | str", folder: str | Path, *, experiment: 
     rollout = _read(Path(folder))
     client = connect(store) if isinstance(store, str) else store
     try:
-        with _alone(rollout.identity):
+        # A handful of locks is enough, and leaves only a handful of files behind.
+        with alone(f"rollout-{rollout.identity[0]}"):
             policy = find_run(client, rollout.policy_run)
             run = _found(client, rollout)
             if run is None:
@@ -199,16 +198,6 @@ def _replace(client: "MlflowClient", run: "Run", tags: dict[str, str], old: set[
         present = run.data.tags.get(name)
         if present != value and (present is None or present in old):
             client.set_tag(run.info.run_id, name, value)
-
-
-@contextmanager
-def _alone(identity: str) -> Iterator[None]:
-    """Keeps other programs of this machine from making the run of the same rollout at the same time."""
-    # A handful of locks is enough, and leaves only a handful of files behind.
-    with (Path(tempfile.gettempdir()) / f"avp-rollout-{os.getuid()}-{identity[0]}.lock").open("w") as file:
-        with suppress(OSError):
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 def command_for(folder: Path, option: str, experiment: str | None = None) -> str:
