@@ -23,7 +23,8 @@ from avp_habitat.rewards import REWARD_NAMES
 from avp_habitat.rollout_capture import capture_heldout, capture_step, publish_rollout
 from avp_habitat.rollout_writer import RolloutWriter
 from avp_habitat.settings import TaskSettings
-from avp_habitat.simulators import SIMULATOR_NAMES, make_simulator
+from avp_habitat.simulators import SimulatorChoice, open_simulator
+from avp_habitat.simulators.options import add_simulator_options, simulator_choice
 from avp_habitat.tracking.addresses import TrackingError, address_of, shown
 from avp_habitat.tracking.early import open_store
 from avp_habitat.tracking.looking import about_run
@@ -44,8 +45,8 @@ class Request:
     """Of the task."""
     seed: int = 0
     """Of the start and of policies that draw at random."""
-    simulator: str = "raycast"
-    """The simulator's name."""
+    simulator: SimulatorChoice = field(default_factory=SimulatorChoice)
+    """Which simulator opens the scene."""
     camera: Intrinsics = field(default_factory=lambda: Intrinsics.from_hfov(640, 480, hfov_deg=90.0))
     """Of the pictures that are written."""
     stochastic: bool = False
@@ -66,7 +67,7 @@ def collect(request: Request) -> dict[str, Any]:
     """
     check_policy(request.policy)
     with RolloutWriter(request.out, request.camera) as writer:
-        simulator = make_simulator(request.simulator, request.scene)
+        simulator = open_simulator(request.simulator, request.scene)
         env, policy = make_policy_env(request.policy, simulator, request.settings, seed=request.seed)
         total = request.settings.budget + request.heldout
         with tqdm(total=total, unit="view", desc=f"collecting {request.out}", disable=None) as progress:
@@ -107,7 +108,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--policy", required=True, metavar="POLICY", help=f"{', '.join(POLICY_NAMES)}, or a PPO model (.zip)")
     add("--out", required=True, type=Path, help="the rollout folder to write; must not exist")
     add("--reward", default="proposed", metavar="REWARD", help=f"{', '.join(REWARD_NAMES)} (default: %(default)s)")
-    add("--simulator", default="raycast", metavar="NAME", help=f"{', '.join(SIMULATOR_NAMES)} (default: %(default)s)")
+    add_simulator_options(parser)
     add("--seed", default=0, type=int, help="of the start and of random policies (default: %(default)s)")
     add("--budget", default=80, type=int, help="steps, which are views (default: %(default)s)")
     add("--width", default=640, type=int, help="of the pictures in pixels (default: %(default)s)")
@@ -142,7 +143,7 @@ def _request(options: argparse.Namespace) -> Request:
         out=options.out,
         settings=settings,
         seed=options.seed,
-        simulator=options.simulator,
+        simulator=simulator_choice(options),
         camera=Intrinsics.from_hfov(options.width, options.height, hfov_deg=settings.hfov_deg),
         stochastic=options.stochastic,
     )

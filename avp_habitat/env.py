@@ -1,6 +1,7 @@
 """`AVP-v0`: the task for one agent as a Gymnasium environment."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -11,7 +12,7 @@ from avp_habitat.agent_view import AgentView
 from avp_habitat.errors import UsageError, unknown_name
 from avp_habitat.poses import Intrinsics
 from avp_habitat.settings import ACTION_NAMES, TaskSettings
-from avp_habitat.simulators import Frames, Simulator, make_simulator
+from avp_habitat.simulators import Frames, Simulator, SimulatorChoice, open_simulator
 from avp_habitat.spaces import action_space, observation_space
 from avp_habitat.task import StepOutcome, ViewpointTask, episode_metrics
 
@@ -35,6 +36,8 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         scene: str = "builtin:0",
         *,
         simulator: str | Simulator = "raycast",
+        gpu: int | None = None,
+        navmesh: str | Path | None = None,
         render_mode: str | None = None,
         settings: TaskSettings | None = None,
         **overrides: Any,
@@ -44,6 +47,8 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         Args:
             scene: a mesh file (`.glb .gltf .ply .obj`), or `builtin:SEED`.
             simulator: `raycast`, `habitat`, or one that is open already (the scene's name is then its own).
+            gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
+            navmesh: file of the scene's NavMesh for `habitat`; computed when omitted.
             render_mode: None, or `rgb_array`: the camera's picture beside the top-down map.
             settings: of the task; the design's defaults when omitted.
             **overrides: single fields of `TaskSettings`, for example `reward="coverage"`, `budget=60`, `width=64`.
@@ -56,13 +61,31 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise unknown_name("render_mode", render_mode, RENDER_MODES)
         self.settings = _with_overrides(settings or TaskSettings(), overrides)
-        self.simulator = make_simulator(simulator, scene) if isinstance(simulator, str) else simulator
+        self.choice = SimulatorChoice.unless_open(simulator, gpu=gpu, navmesh=navmesh)
+        """How the simulator was chosen; None for one that was open already."""
         self.render_mode = render_mode
         self.observation_space = observation_space(self.settings.observation)
         self.action_space = action_space()
-        self.area = self.simulator.area
-        self._task = ViewpointTask(self.simulator, self.settings, agents=1)
-        self._running = False
+        self._enter(scene, simulator)
+
+    def change_scene(self, scene: str) -> None:
+        """Leave the scene for another one in the same kind of simulator; `reset` starts there.
+
+        Args:
+            scene: as for a new environment.
+
+        Raises:
+            UsageError: the simulator was given open, or its NavMesh is that of the present scene.
+            SceneError: the scene cannot be used.
+            SimulatorError: the simulator cannot open it.
+        """
+        if self.choice is None:
+            raise UsageError("change_scene: expected a simulator chosen by name, got one that was open already")
+        if self.choice.navmesh is not None:
+            raise UsageError(f"change_scene: {self.choice.navmesh} is the NavMesh of {self.scene_name}; leave it out")
+        # Freed before the next one is opened: a process can hold a single simulator of some kinds.
+        del self.simulator, self.area, self._task
+        self._enter(scene, self.choice.name)
 
     @property
     def scene_name(self) -> str:
@@ -155,6 +178,17 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         """End the episode; the simulator is shared and goes with its last user."""
         self._running = False
 
+    def _enter(self, scene: str, simulator: str | Simulator) -> None:
+        if self.choice is not None:
+            simulator = open_simulator(self.choice, scene)
+        assert not isinstance(simulator, str)
+        self.scene = scene
+        """As given."""
+        self.simulator = simulator
+        self.area = simulator.area
+        self._task = ViewpointTask(simulator, self.settings, agents=1)
+        self._running = False
+
     def _place(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
         if position.shape not in ((2,), (3,)) or not np.isfinite(position).all():
             raise UsageError(f"position: expected x, z or x, y, z in metres, got {position.tolist()}")
@@ -197,5 +231,7 @@ def step_info(task: ViewpointTask, outcome: StepOutcome) -> list[dict[str, Any]]
 def _with_overrides(settings: TaskSettings, overrides: dict[str, Any]) -> TaskSettings:
     for name in overrides:
         if name not in TaskSettings.__dataclass_fields__:
-            raise unknown_name("AVP-v0 option", name, ["scene", "simulator", *TaskSettings.__dataclass_fields__])
+            raise unknown_name(
+                "AVP-v0 option", name, ["scene", "simulator", "gpu", "navmesh", *TaskSettings.__dataclass_fields__]
+            )
     return replace(settings, **overrides)

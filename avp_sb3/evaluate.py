@@ -17,7 +17,7 @@ from avp_habitat.errors import UsageError
 from avp_habitat.policies import POLICY_NAMES
 from avp_habitat.rewards import REWARD_NAMES
 from avp_habitat.settings import OBSERVATION_NAMES, TaskSettings
-from avp_habitat.simulators import SIMULATOR_NAMES
+from avp_habitat.simulators.options import add_simulator_options, simulator_choice
 from avp_habitat.trajectory import Trajectory
 from avp_sb3.evaluation import Contestant, EpisodeResult, PolicyResult, run_episodes
 from avp_sb3.evaluation_report import check_new, table, write_report
@@ -45,7 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--observation", default=None, metavar="KIND", help=f"{', '.join(OBSERVATION_NAMES)} (default: the model's own)"
     )
-    add("--simulator", default="raycast", metavar="NAME", help=f"{', '.join(SIMULATOR_NAMES)} (default: %(default)s)")
+    add_simulator_options(parser)
     add("--budget", default=80, type=int, help="steps, which are views (default: %(default)s)")
     add("--width", default=160, type=int, help="of the policy's depth image in pixels (default: %(default)s)")
     add("--height", default=120, type=int, help="of the policy's depth image in pixels (default: %(default)s)")
@@ -73,13 +73,16 @@ def main(argv: Sequence[str]) -> None:
     """Evaluate, print the table, write the report, log it."""
     options = _options(argv)
     settings = TaskSettings(reward=options.reward, budget=options.budget, width=options.width, height=options.height)
+    choice = simulator_choice(options)
     # All of them before the first episode, so that the last one's fault does not cost the others' time.
     contestants = [
         Contestant(
             policy,
             options.scene,
             settings,
-            simulator=options.simulator,
+            simulator=choice.name,
+            gpu=choice.gpu,
+            navmesh=choice.navmesh,
             observation=options.observation,
             stochastic=options.stochastic,
         )

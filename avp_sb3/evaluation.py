@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -81,6 +82,8 @@ class Contestant:
         settings: TaskSettings,
         *,
         simulator: str = "raycast",
+        gpu: int | None = None,
+        navmesh: str | Path | None = None,
         observation: str | None = None,
         stochastic: bool = False,
     ) -> None:
@@ -91,6 +94,8 @@ class Contestant:
             scene: a mesh file, or `builtin:SEED`.
             settings: of the task; visibility is always computed, never looked up.
             simulator: the simulator's name.
+            gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
+            navmesh: file of the scene's NavMesh for `habitat`; computed when omitted.
             observation: kind of observation; what the model was trained on when omitted.
             stochastic: sample a model's actions instead of taking the likeliest.
 
@@ -104,8 +109,9 @@ class Contestant:
         self.trajectory: Trajectory | None = None
         """Of the last episode that ended."""
         self._stochastic = stochastic
+        opened = make_simulator(simulator, scene, gpu=gpu, navmesh=navmesh)
         self.env, self._policy = make_policy_env(
-            policy, make_simulator(simulator, scene), replace(settings, lookup=False), observation=observation
+            policy, opened, replace(settings, lookup=False), observation=observation
         )
 
     @property
@@ -158,7 +164,7 @@ def evaluate_policy(
         seed: of the first episode.
         settings: of the task; the design's defaults when omitted. Visibility is always computed, never looked up.
         on_episode: called after each episode.
-        **options: `simulator`, `observation` and `stochastic` of `Contestant`.
+        **options: `simulator`, `gpu`, `navmesh`, `observation` and `stochastic` of `Contestant`.
 
     Raises:
         AVPError: as `Contestant`.

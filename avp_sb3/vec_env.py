@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -14,7 +15,7 @@ from avp_habitat.env import step_info
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics
 from avp_habitat.settings import TaskSettings
-from avp_habitat.simulators import Frames, Simulator, make_simulator
+from avp_habitat.simulators import ONE_PER_PROCESS, Frames, Simulator, SimulatorChoice, open_simulator
 from avp_habitat.spaces import action_space, observation_space
 from avp_habitat.task import ViewpointTask
 
@@ -32,6 +33,8 @@ class AVPVecEnv(VecEnv):
         *,
         agents: int = 16,
         simulator: str | Simulator | Sequence[Simulator] = "raycast",
+        gpu: int | None = None,
+        navmesh: str | Path | None = None,
         settings: TaskSettings | None = None,
         seed: int | None = None,
     ) -> None:
@@ -41,15 +44,17 @@ class AVPVecEnv(VecEnv):
             scene: a mesh file, or `builtin:SEED`, or several; agent i walks in scene i modulo their number.
             agents: n, at least 1, and at least one for each scene.
             simulator: a simulator's name, or those that are open already, one for each scene (names are then theirs).
+            gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
+            navmesh: file of the only scene's NavMesh for `habitat`; computed when omitted.
             settings: of the task; when omitted, the design's defaults, looked up where the simulator casts rays.
             seed: of the starts; agent i uses `seed + i`, as SB3 seeds separate environments.
 
         Raises:
             UsageError: too few agents, more than memory allows, or an unknown name.
             SceneError: a scene cannot be used; the text names it.
-            SimulatorError: the simulator cannot run here.
+            SimulatorError: the simulator cannot run here, or several scenes need a process each (`AVPSubprocVecEnv`).
         """
-        self.simulators = _open(scene, simulator)
+        self.simulators = _open(scene, simulator, gpu=gpu, navmesh=navmesh)
         casts = all(each.name == "raycast" for each in self.simulators)
         self.settings = settings or TaskSettings(lookup=casts)
         if agents < len(self.simulators):
@@ -79,6 +84,10 @@ class AVPVecEnv(VecEnv):
         self._reset_options()
         self.reset_infos = [{"coverage": 0.0, "views": 0} for _ in range(self.num_envs)]
         return self._restart(range(self.num_envs))
+
+    def seed_agents(self, seeds: Sequence[int | None]) -> None:
+        """Seed the starts of the next `reset`, `(n,)`; None leaves an agent's generator as it is."""
+        self._seeds = list(seeds)
 
     def step_async(self, actions: NDArray[np.integer]) -> None:
         """Remember the `(n,)` actions."""
@@ -157,10 +166,30 @@ def _check_memory(agents: int, simulators: Sequence[Simulator], settings: TaskSe
         )
 
 
-def _open(scene: str | Sequence[str], simulator: str | Simulator | Sequence[Simulator]) -> list[Simulator]:
-    if not isinstance(simulator, str):
-        return list(simulator) if isinstance(simulator, Sequence) else [simulator]
+def _open(
+    scene: str | Sequence[str], simulator: str | Simulator | Sequence[Simulator], **options: Any
+) -> list[Simulator]:
+    choice = SimulatorChoice.unless_open(simulator, **options)
+    if choice is None:
+        return list(simulator) if isinstance(simulator, Sequence) else [simulator]  # type: ignore[list-item]
+    scenes = scenes_given(scene, choice)
+    if len(scenes) > 1 and choice.name in ONE_PER_PROCESS:
+        raise UsageError(
+            f"AVPVecEnv: a process can hold one simulator of {choice.name!r}, expected one scene, got {len(scenes)}: "
+            f"{', '.join(scenes)}; use AVPSubprocVecEnv, which gives each scene a process of its own"
+        )
+    return [open_simulator(choice, name) for name in scenes]
+
+
+def scenes_given(scene: str | Sequence[str], choice: SimulatorChoice) -> list[str]:
+    """The scenes as a list.
+
+    Raises:
+        UsageError: there are none, or several for one NavMesh.
+    """
     scenes = [scene] if isinstance(scene, str) else list(scene)
     if not scenes:
         raise UsageError("scene: expected at least one, got none")
-    return [make_simulator(simulator, name) for name in scenes]
+    if choice.navmesh is not None and len(scenes) > 1:
+        raise UsageError(f"navmesh: {choice.navmesh} is of one scene, got {len(scenes)}: {', '.join(scenes)}")
+    return scenes

@@ -1,54 +1,75 @@
 """The simulators by name, made once per scene and process."""
 
+import gc
 import weakref
 from collections.abc import Callable
 from pathlib import Path
 
-from avp_habitat.errors import unknown_name
+from avp_habitat.errors import SimulatorError
 from avp_habitat.simulators.base import Frames, Simulator
+from avp_habitat.simulators.options import SIMULATOR_NAMES, SimulatorChoice
 
-__all__ = ["SIMULATOR_NAMES", "Frames", "Simulator", "make_simulator", "open_scenes"]
+__all__ = [
+    "ONE_PER_PROCESS",
+    "SIMULATOR_NAMES",
+    "Frames",
+    "Simulator",
+    "SimulatorChoice",
+    "make_simulator",
+    "open_scenes",
+    "open_simulator",
+]
 
 
-def _raycast(scene: str) -> Simulator:
+def _raycast(scene: str, _choice: SimulatorChoice) -> Simulator:
     from avp_habitat.scenes.loader import load_scene
     from avp_habitat.simulators.raycast import RaycastSimulator
 
     return RaycastSimulator(load_scene(scene))
 
 
-def _habitat(scene: str) -> Simulator:
+def _habitat(scene: str, choice: SimulatorChoice) -> Simulator:
     from avp_habitat.simulators.habitat import HabitatSimulator
 
-    return HabitatSimulator(scene)
+    return HabitatSimulator(scene, gpu=choice.gpu, navmesh=choice.navmesh)
 
 
-_FACTORIES: dict[str, Callable[[str], Simulator]] = {"raycast": _raycast, "habitat": _habitat}
-SIMULATOR_NAMES = tuple(_FACTORIES)
+_Key = tuple[SimulatorChoice, str, float]
+_FACTORIES: dict[str, Callable[[str, SimulatorChoice], Simulator]] = {"raycast": _raycast, "habitat": _habitat}
+ONE_PER_PROCESS = ("habitat",)
+"""Simulators of which a process can hold one only."""
 # Simulators hold no state of an episode, so all environments of a process on one scene share one; it is freed with
 # the last of them.
-_shared: weakref.WeakValueDictionary[tuple[str, str, float], Simulator] = weakref.WeakValueDictionary()
+_shared: weakref.WeakValueDictionary[_Key, Simulator] = weakref.WeakValueDictionary()
 
 
-def make_simulator(name: str, scene: str) -> Simulator:
+def make_simulator(name: str, scene: str, *, gpu: int | None = None, navmesh: str | Path | None = None) -> Simulator:
     """The simulator `name` on a scene.
 
     Args:
         name: `raycast` or `habitat`.
-        scene: a mesh file, or `builtin:SEED`.
+        scene: a mesh file, or `builtin:SEED`; `habitat` takes more (its class says what).
+        gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
+        navmesh: file of the scene's NavMesh for `habitat`; computed when omitted.
 
     Raises:
-        UsageError: no such simulator, or a scene name that cannot be right.
+        UsageError: no such simulator, an option that it does not have, or a scene name that cannot be right.
         SceneError: the scene cannot be read, or nobody can stand in it.
-        SimulatorError: the simulator is not installed or cannot run here.
+        SimulatorError: the simulator is not installed or cannot run here, or this process has another one open.
     """
-    if name not in _FACTORIES:
-        raise unknown_name("simulator", name, SIMULATOR_NAMES)
+    return open_simulator(SimulatorChoice.of(name, gpu=gpu, navmesh=navmesh), scene)
+
+
+def open_simulator(choice: SimulatorChoice, scene: str) -> Simulator:
+    """The chosen simulator on a scene; arguments and errors as of `make_simulator`."""
+    choice.check()
     path = Path(scene)
-    key = (name, scene, path.stat().st_mtime if path.is_file() else 0.0)
+    key = (choice, str(path.resolve()), path.stat().st_mtime) if path.is_file() else (choice, scene, 0.0)
     simulator = _shared.get(key)
     if simulator is None:
-        simulator = _FACTORIES[name](scene)
+        if choice.name in ONE_PER_PROCESS:
+            _check_alone(choice.name, scene)
+        simulator = _FACTORIES[choice.name](scene, choice)
         _shared[key] = simulator
     return simulator
 
@@ -56,3 +77,20 @@ def make_simulator(name: str, scene: str) -> Simulator:
 def open_scenes() -> dict[str, str]:
     """SHA-256 digests by name of the scenes that simulators of this process have open."""
     return {simulator.scene: simulator.scene_digest for simulator in list(_shared.values())}
+
+
+def _check_alone(name: str, scene: str) -> None:
+    """Refuse a second simulator before it is made, where a process can hold one only."""
+    if not _open_already(name):
+        return
+    gc.collect()  # An environment that nobody uses any more may be left in a circle of references.
+    if found := _open_already(name):
+        raise SimulatorError(
+            f"{name}: a process can hold one simulator, and this one has {found[0]} open already, so that {scene} "
+            'needs a process of its own: SubprocVecEnv(start_method="forkserver"), or avp_sb3.AVPSubprocVecEnv for '
+            'several scenes; simulator="raycast" has no such limit'
+        )
+
+
+def _open_already(name: str) -> list[str]:
+    return [simulator.scene for (choice, _, _), simulator in list(_shared.items()) if choice.name == name]
