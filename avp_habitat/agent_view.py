@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.settings import TaskSettings
 from avp_habitat.simulators.base import Simulator
+from avp_habitat.simulators.elsewhere import SimulatorElsewhere
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,10 @@ class AgentView:
     def area(self) -> NavigableArea:
         """The scene's navigable area; unobserved parts of its mask are not known to the agent."""
         return self.simulator.area
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For other processes, where the simulator itself cannot follow."""
+        return self.__dict__ | {"simulator": SimulatorElsewhere.of(self.simulator)}
 
 
 def agent_views(env: Any) -> list[AgentView]:

@@ -9,9 +9,11 @@ if TYPE_CHECKING:
     from avp_sb3.metrics_callback import MetricsCallback
     from avp_sb3.mlflow_callback import MLflowCallback
     from avp_sb3.rerun_callback import RerunCallback
+    from avp_sb3.subproc import AVPSubprocVecEnv
     from avp_sb3.vec_env import AVPVecEnv
 
 __all__ = [
+    "AVPSubprocVecEnv",
     "AVPVecEnv",
     "EvaluationCallback",
     "MLflowCallback",
@@ -22,6 +24,7 @@ __all__ = [
 ]
 
 _HOME = {
+    "AVPSubprocVecEnv": "avp_sb3.subproc",
     "AVPVecEnv": "avp_sb3.vec_env",
     "EvaluationCallback": "avp_sb3.evaluation_callback",
     "MetricsCallback": "avp_sb3.metrics_callback",

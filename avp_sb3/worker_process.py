@@ -1,0 +1,119 @@
+"""A worker process of `AVPSubprocVecEnv`: agents in one scene, in a simulator of the process's own."""
+
+# Nothing heavy here: until `serve` runs, an interruption would end in a traceback of this process.
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from avp_habitat.errors import AVPError
+from avp_habitat.settings import TaskSettings
+from avp_habitat.simulators.options import SimulatorChoice
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+
+    from avp_sb3.vec_env import AVPVecEnv
+
+
+@dataclass(frozen=True)
+class Order:
+    """What a worker has to open."""
+
+    scene: str
+    """As the user gave it."""
+    choice: SimulatorChoice
+    """Of the simulator."""
+    agents: int
+    """At least 1."""
+    settings: TaskSettings
+    """Of the task."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An answer that is an error; exceptions themselves do not all survive the way to another process."""
+
+    kind: str
+    """Name of the exception's class."""
+    text: str
+    """Of the exception."""
+
+
+def serve(pipe: "Connection", order: Order) -> None:
+    """Open the scene, then answer requests until the pipe is closed.
+
+    Requests are `(ticket, name, arguments)`, answers `(ticket, value or Failure)`. The first answer, of ticket 0,
+    says that the scene is open, or why not. Ctrl-C is left to the parent, which ends its workers.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _leave)
+    opened: list[AVPVecEnv] = []
+    try:
+        ready = _attempt(lambda: opened.append(_open(order)))
+        pipe.send((0, ready))
+        while opened:
+            ticket, name, arguments = pipe.recv()
+            _answer(pipe, ticket, _attempt(lambda: _COMMANDS[name](opened[0], *arguments)))  # noqa: B023
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        pass  # The parent has closed its end, or is gone.
+    finally:
+        # Python's own cleaning at exit is not done in such a process.
+        for simulator in opened[0].simulators if opened else []:
+            simulator.close()
+
+
+def _leave(_signum: int, _frame: object) -> None:
+    sys.exit(128 + signal.SIGTERM)
+
+
+def _open(order: Order) -> "AVPVecEnv":
+    from avp_sb3.vec_env import AVPVecEnv
+
+    choice = order.choice
+    return AVPVecEnv(
+        order.scene,
+        agents=order.agents,
+        simulator=choice.name,
+        gpu=choice.gpu,
+        navmesh=choice.navmesh,
+        settings=order.settings,
+    )
+
+
+def _attempt(work: Callable[[], Any]) -> Any:
+    try:
+        return work()
+    except (AVPError, AttributeError) as error:
+        return Failure(type(error).__name__, str(error))
+    except Exception as error:
+        # A mistake of ours: where it happened is worth more than one line.
+        traceback.print_exc()
+        return Failure(type(error).__name__, f"{error} (process {os.getpid()}; its traceback stands above)")
+
+
+def _answer(pipe: "Connection", ticket: int, value: Any) -> None:
+    try:
+        pipe.send((ticket, value))
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        raise
+    except Exception as error:  # Pickle raises whatever the object's own code raises.
+        text = f"{type(value).__name__} cannot leave the process of its simulator: {error}"
+        pipe.send((ticket, Failure("UsageError", text)))
+
+
+def _reset(env: "AVPVecEnv", seeds: list[int | None]) -> Any:
+    env.seed_agents(seeds)
+    return env.reset()
+
+
+_COMMANDS: dict[str, Callable[..., Any]] = {
+    "reset": _reset,
+    "step": lambda env, actions: env.step(actions),
+    "has_attr": lambda env, name: env.has_attr(name),
+    "get_attr": lambda env, name, rows: env.get_attr(name, rows),
+    "env_method": lambda env, name, rows, args, kwargs: env.env_method(name, *args, indices=rows, **kwargs),
+}
