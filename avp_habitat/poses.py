@@ -114,6 +114,18 @@ def z_up_to_y_up(pose: Float) -> Float:
     return _Y_UP_TO_Z_UP.T @ np.asarray(pose)
 
 
+def axes_to_world(up: tuple[float, float, float], front: tuple[float, float, float]) -> NDArray[np.float64]:
+    """The `(3, 3)` rotation from a file with these axes to the world: up becomes +Y, front -Z.
+
+    It is the frame that Habitat-Sim builds of a stage config's `up` and `front` (a rotation only).
+
+    Args:
+        up: unit vector in the file's coordinates.
+        front: unit vector in the file's coordinates, at right angles to `up`.
+    """
+    return np.array([np.cross(front, up), up, np.negative(front)], dtype=np.float64)
+
+
 def pixel_directions(intrinsics: Intrinsics) -> Float:
     """`(height, width, 3)` habitat camera-frame directions through the pixel centres, with z = -1.
 

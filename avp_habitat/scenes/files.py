@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
 
+SUFFIXES = (".glb", ".gltf", ".ply", ".obj")
+"""Of the meshes that can be read."""
+
 
 class SceneFiles:
     """Reads a scene's file and the files it refers to, none of which may lie outside the scene's folder."""

@@ -1,19 +1,19 @@
-"""From what the user calls a scene, a path or `builtin:SEED`, to its mesh."""
+"""From what the user calls a scene to its mesh in the world."""
 
-import difflib
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from avp_habitat.errors import SceneError, UsageError
+from avp_habitat.errors import SceneError
+from avp_habitat.poses import axes_to_world
 from avp_habitat.scenes.files import SceneFiles
+from avp_habitat.scenes.location import BUILTIN, SceneLocation, locate
 from avp_habitat.scenes.mesh import TexturedMesh
+from avp_habitat.scenes.stage_config import Y_UP
 
-BUILTIN = "builtin:"
 _GLTF = (".glb", ".gltf")
-SUFFIXES = (*_GLTF, ".ply", ".obj")
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Scene:
     name: str
     """What the user called it, without folders: a file's name or `builtin:SEED`."""
     digest: str
-    """Hexadecimal SHA-256 of the content: of the file and those it refers to, or of seed and generator version."""
+    """Hexadecimal SHA-256 of the content; see `scene_digest`."""
     mesh: TexturedMesh
     """Its surfaces, world frame, metres."""
 
@@ -32,37 +32,67 @@ def load_scene(spec: str) -> Scene:
     """Load a scene.
 
     Args:
-        spec: path of a `.glb`, `.gltf`, `.ply` or `.obj` file (metres, Y up), or `builtin:SEED` for a generated room.
+        spec: a mesh (metres), a scene of Replica or of a scene dataset config, or `builtin:SEED` for a generated room;
+            `avp_habitat.scenes.location.locate` says what can be written.
 
     Raises:
-        UsageError: the suffix is not supported, or SEED is not an integer >= 0.
-        SceneError: the file is missing, damaged, or holds no triangle.
+        UsageError: nothing that a scene could be called.
+        SceneError: the scene is missing, damaged, holds no triangle, or has objects, which only Habitat-Sim shows.
     """
-    return _generated(spec) if spec.startswith(BUILTIN) else _read(Path(spec))
+    location = locate(spec)
+    if location.asset is None:
+        from avp_habitat.scenes.builtin import generate_room
 
-
-def _generated(spec: str) -> Scene:
-    text = spec.removeprefix(BUILTIN)
-    if not (text.isascii() and text.isdigit()):
-        raise UsageError(f"{spec}: expected {BUILTIN}SEED with an integer SEED >= 0, got {text!r}")
-    from avp_habitat.scenes.builtin import GENERATOR_VERSION, generate_room
-
-    seed = int(text)
-    content = f"{BUILTIN}{seed}:v{GENERATOR_VERSION}"
-    return Scene(f"{BUILTIN}{seed}", hashlib.sha256(content.encode()).hexdigest(), generate_room(seed))
-
-
-def _read(path: Path) -> Scene:
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        found = f"the suffix {path.suffix!r}" if suffix else "no suffix"
-        raise UsageError(
-            f"{path}: expected a scene file ({', '.join(SUFFIXES)}) or {BUILTIN}SEED, got a name with {found}"
+        return Scene(location.name, scene_digest(location), generate_room(_seed(location)))
+    if location.objects:
+        raise SceneError(
+            f"{location.dataset}:{location.scene_id}: has {location.objects} objects besides its stage, which raycast "
+            "does not show; use --simulator habitat"
         )
-    if not path.is_file():
-        raise _missing(path)
-    files = SceneFiles(path)
-    if suffix in _GLTF:
+    files = SceneFiles(location.asset)
+    mesh = _to_world(_read(files), location)
+    return Scene(location.name, _digest(location, files), mesh)
+
+
+def scene_digest(location: SceneLocation) -> str:
+    """Hexadecimal SHA-256 of what a scene is made of, the same as that of the loaded scene.
+
+    It covers the mesh and the files that it refers to; where a scene has configs or axes other than Y up, -Z front,
+    those too (of objects, the config that names them); of a generated room the seed and the generator's version.
+
+    Raises:
+        SceneError: the mesh is damaged, or holds no triangle.
+    """
+    if location.asset is None:
+        from avp_habitat.scenes.builtin import GENERATOR_VERSION
+
+        return hashlib.sha256(f"{BUILTIN}{_seed(location)}:v{GENERATOR_VERSION}".encode()).hexdigest()
+    files = SceneFiles(location.asset)
+    try:
+        _read(files)
+    except SceneError as error:
+        # The textures of HM3D, which only Habitat-Sim reads; they are part of the file itself.
+        if "KHR_texture_basisu" not in str(error):
+            raise
+    return _digest(location, files)
+
+
+def _seed(location: SceneLocation) -> int:
+    return int(location.name.removeprefix(BUILTIN))
+
+
+def _digest(location: SceneLocation, files: SceneFiles) -> str:
+    axes = (location.up, location.front)
+    if axes == Y_UP and not location.files:
+        return files.digest()
+    content = hashlib.sha256(f"{files.digest()} {axes} {location.scene_id}".encode())
+    for path in location.files:
+        content.update(hashlib.sha256(path.read_bytes()).digest())
+    return content.hexdigest()
+
+
+def _read(files: SceneFiles) -> TexturedMesh:
+    if files.path.suffix.lower() in _GLTF:
         from avp_habitat.scenes.gltf import read_gltf
 
         mesh = read_gltf(files)
@@ -70,19 +100,18 @@ def _read(path: Path) -> Scene:
         from avp_habitat.scenes.polygon_files import read_polygons
 
         mesh = read_polygons(files)
-    _check(mesh, path)
-    return Scene(path.name, files.digest(), mesh)
+    _check(mesh, files.path)
+    return mesh
 
 
-def _missing(path: Path) -> SceneError:
-    if path.exists():
-        return SceneError(f"{path}: expected a scene file, found a folder")
-    if not path.parent.is_dir():
-        return SceneError(f"{path}: there is no folder {path.parent}")
-    names = sorted(entry.name for entry in path.parent.iterdir() if entry.suffix.lower() in SUFFIXES)
-    near = difflib.get_close_matches(path.name, names, n=1, cutoff=0.5)
-    hint = f"; did you mean {near[0]}?" if near else ""
-    return SceneError(f"{path}: no such scene file{hint}")
+def _to_world(mesh: TexturedMesh, location: SceneLocation) -> TexturedMesh:
+    """The mesh turned from its file's axes; written out, because BLAS may add in another order on other machines."""
+    if (location.up, location.front) == Y_UP:
+        return mesh
+    x, y, z = mesh.vertices.astype(np.float64).T
+    rows = axes_to_world(location.up, location.front)
+    turned = np.stack([row[0] * x + row[1] * y + row[2] * z for row in rows], axis=1)
+    return replace(mesh, vertices=turned.astype(np.float32))
 
 
 def _check(mesh: TexturedMesh, path: Path) -> None:

@@ -1,0 +1,137 @@
+"""From what the user calls a scene to the mesh file that is shown, and the axes of that file."""
+
+import difflib
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from avp_habitat.errors import SceneError, UsageError
+from avp_habitat.scenes import replica
+from avp_habitat.scenes.files import SUFFIXES
+from avp_habitat.scenes.stage_config import STAGE_CONFIG, Y_UP, Z_UP, Layer, Vector, read_config, read_stage
+
+BUILTIN = "builtin:"
+DATASET_CONFIG = ".scene_dataset_config.json"
+HELP = (
+    f"a mesh ({' '.join(SUFFIXES)}), a scene folder of Replica, NAME{STAGE_CONFIG}, NAME{DATASET_CONFIG}:ID, or "
+    f"{BUILTIN}SEED for a generated room"
+)
+"""What a command line says of its option for scenes."""
+
+
+@dataclass(frozen=True)
+class SceneLocation:
+    """Where a scene is."""
+
+    name: str
+    """As rollouts call it, without folders: a file's name, `room_0`, or `builtin:SEED`."""
+    asset: Path | None
+    """The mesh file that is shown; None for a generated room."""
+    up: Vector = Y_UP[0]
+    """Unit vector in the asset's coordinates that points up."""
+    front: Vector = Y_UP[1]
+    """Unit vector in the asset's coordinates, at right angles to `up`, that becomes the world's -Z."""
+    dataset: Path | None = None
+    """The scene dataset config that the scene belongs to, None for one that was named without it."""
+    scene_id: str | None = None
+    """The scene's id there: the handle that the user's id stands for, which no other scene has."""
+    objects: int = 0
+    """Objects, articulated ones included, that the scene has beyond its stage."""
+    files: tuple[Path, ...] = field(default=())
+    """The configs that were read: of the dataset, of the scene, of the stage."""
+
+
+def locate(spec: str) -> SceneLocation:
+    """Find a scene without reading its mesh.
+
+    Args:
+        spec: path of a `.glb`, `.gltf`, `.ply` or `.obj` file (Y up); scene folder of Replica or a mesh in it (Z up);
+            `NAME.stage_config.json`; `NAME.scene_dataset_config.json:ID`; or `builtin:SEED` for a generated room.
+
+    Raises:
+        UsageError: nothing that a scene could be called, or a dataset config without an id.
+        SceneError: the scene is missing, or a config is damaged, asks for what is not supported, or refers to what is
+            missing or lies outside of the data set's folder (of a stage config alone: the folder above its own).
+    """
+    if spec.startswith(BUILTIN):
+        return SceneLocation(f"{BUILTIN}{_seed(spec)}", None)
+    dataset, mark, scene_id = spec.partition(f"{DATASET_CONFIG}:")
+    if mark or spec.endswith(DATASET_CONFIG):
+        return _in_dataset(Path(f"{dataset}{DATASET_CONFIG}" if mark else spec), scene_id)
+    path = Path(spec)
+    if spec.endswith(STAGE_CONFIG):
+        return _stage(path)
+    if path.is_dir():
+        path = _mesh_of(path)
+    elif path.suffix.lower() not in SUFFIXES:
+        raise _unknown(path)
+    _expect_file(path, SUFFIXES)
+    return _mesh(path)
+
+
+def _seed(spec: str) -> int:
+    text = spec.removeprefix(BUILTIN)
+    if not (text.isascii() and text.isdigit()):
+        raise UsageError(f"{spec}: expected {BUILTIN}SEED with an integer SEED >= 0, got {text!r}")
+    return int(text)
+
+
+def _mesh(path: Path) -> SceneLocation:
+    scene = replica.scene_folder(path)
+    return SceneLocation(path.name, path) if scene is None else SceneLocation(scene.name, path, *Z_UP)
+
+
+def _mesh_of(folder: Path) -> Path:
+    """The mesh that is shown of a scene folder of Replica."""
+    if replica.is_scene(Path(os.path.abspath(folder))):
+        return folder / replica.MESH
+    scenes = replica.scenes_within(folder)
+    hint = f"; name one of its {len(scenes)} scenes, {folder / scenes[0]} say" if scenes else ""
+    raise SceneError(f"{folder}: expected a scene file, found a folder that is no scene of Replica{hint}")
+
+
+def _stage(path: Path) -> SceneLocation:
+    _expect_file(path, (STAGE_CONFIG,))
+    scene = replica.scene_folder(path)
+    name = path.name.removesuffix(STAGE_CONFIG)
+    # Replica's stage config lies in habitat/ and shows ../mesh.ply, so the folder above is part of the data.
+    stage = read_stage(
+        [Layer(read_config(path), path)],
+        path.parent,
+        Path(os.path.abspath(path)).parents[1],
+        name=name,
+        axes=Y_UP if scene is None else Z_UP,
+    )
+    return SceneLocation(name if scene is None else scene.name, stage.asset, *stage.axes, files=(path,))
+
+
+def _in_dataset(path: Path, scene_id: str) -> SceneLocation:
+    from avp_habitat.scenes.dataset import SceneDataset
+
+    _expect_file(path, (DATASET_CONFIG,))
+    found = SceneDataset(path).scene(scene_id)
+    return SceneLocation(
+        found.name, found.stage.asset, *found.stage.axes, path, found.handle, found.objects, (path, *found.files)
+    )
+
+
+def _unknown(path: Path) -> UsageError:
+    found = f"the suffix {path.suffix!r}" if path.suffix else "no suffix"
+    return UsageError(
+        f"{path}: expected a scene file ({', '.join(SUFFIXES)}), a scene folder of Replica, NAME{STAGE_CONFIG}, "
+        f"NAME{DATASET_CONFIG}:ID or {BUILTIN}SEED, got a name with {found}"
+    )
+
+
+def _expect_file(path: Path, endings: tuple[str, ...]) -> None:
+    """Refuse a path that is no file, with the nearest name of one that ends likewise."""
+    if path.is_file():
+        return
+    if path.exists():
+        raise SceneError(f"{path}: expected a scene file, found a folder")
+    if not path.parent.is_dir():
+        raise SceneError(f"{path}: there is no folder {path.parent}")
+    names = sorted(entry.name for entry in path.parent.iterdir() if entry.name.lower().endswith(endings))
+    near = difflib.get_close_matches(path.name, names, n=1, cutoff=0.5)
+    hint = f"; did you mean {near[0]}?" if near else ""
+    raise SceneError(f"{path}: no such scene file{hint}")

@@ -1,0 +1,197 @@
+"""Habitat-Sim's stage configs: the mesh that a stage shows, and the axes of that mesh."""
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from avp_habitat.errors import SceneError
+from avp_habitat.scenes.files import SUFFIXES
+
+STAGE_CONFIG = ".stage_config.json"
+Vector = tuple[float, float, float]
+Axes = tuple[Vector, Vector]
+Y_UP: Axes = ((0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
+"""Up and front of glTF, of the suite's world, and of a stage config that names neither.
+
+In version 0.3.4 (AbstractObjectAttributes and StageAttributesManager in its sources) this holds for a config whose
+render asset is a `.glb` too: only an asset without any config is taken for Z-up because of that suffix.
+"""
+Z_UP: Axes = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
+"""Up and front of Replica, Matterport3D and HM3D."""
+_FILE_NAME_TAG = "%%CONFIG_NAME_AS_ASSET_FILENAME%%"
+_NEUTRAL = {"origin": [0, 0, 0], "scale": [1, 1, 1], "units_to_meters": 1}
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Attributes from one place; of several layers the last one that has a key decides."""
+
+    values: Mapping[str, Any]
+    """As they stand in the JSON file."""
+    path: Path
+    """That file."""
+    where: str = ""
+    """Where in the file, as it is put before a key: `stages.default_attributes.`, say."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What a stage shows."""
+
+    asset: Path
+    """The mesh file; it exists."""
+    axes: Axes
+    """Unit vectors up and front in the asset's coordinates, at right angles."""
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """The object that a JSON file holds.
+
+    Raises:
+        SceneError: the file cannot be read, or holds something else.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{path}: expected JSON, but it is damaged: {error}") from error
+    if not isinstance(content, dict):
+        raise SceneError(f"{path}: expected a JSON object, got {shown(content)}")
+    return content
+
+
+def read_stage(layers: Sequence[Layer], folder: Path, root: Path, *, name: str, axes: Axes = Y_UP) -> Stage:
+    """The stage that attributes describe.
+
+    Args:
+        layers: the attributes; the last layer is the stage's own.
+        folder: that relative paths start from.
+        root: folder of the data set, outside of which nothing is read.
+        name: of the stage, which stands for a tag that defaults may hold.
+        axes: where the attributes name none.
+
+    Raises:
+        SceneError: an attribute is missing or cannot be right, or moves or scales the stage.
+    """
+    for key, neutral in _NEUTRAL.items():
+        expect_neutral(layers, key, neutral)
+    asset = _asset(layers, folder, root, name)
+    up, front = _axes(layers, axes)
+    if asset.name.endswith("_semantic.ply") and find(layers, "render_asset_type")[0] in (None, "semantic"):
+        # Habitat-Sim takes a mesh of such a name for one with semantic labels, and turns it from Z-up to Y-up before
+        # it applies the config's axes (GenericSemanticMeshData in its sources).
+        up, front = (up[0], 0.0 - up[2], up[1]), (front[0], 0.0 - front[2], front[1])
+    return Stage(asset, (up, front))
+
+
+def find(layers: Sequence[Layer], key: str) -> tuple[Any, Layer]:
+    """The value of a key and the layer that has it; None and the last layer where none has it."""
+    found = [layer for layer in layers if layer.values.get(key) is not None]
+    return (found[-1].values[key], found[-1]) if found else (None, layers[-1])
+
+
+def expect_neutral(layers: Sequence[Layer], key: str, *neutral: Any) -> None:
+    """Refuse an attribute that moves, turns or scales a stage.
+
+    Habitat-Sim 0.3.4 reads origin, units_to_meters and the stage's place in a scene instance without using them, and
+    scales what is seen but not the NavMesh; older versions do not scale. No two simulators would show the same scene.
+
+    Args:
+        layers: the attributes.
+        key: of the one attribute.
+        neutral: values that change nothing.
+
+    Raises:
+        SceneError: the attribute is there and is not neutral.
+    """
+    value, layer = find(layers, key)
+    if value is None or value in neutral:
+        return
+    raise SceneError(
+        f"{layer.path}: {layer.where}{key}: expected {shown(neutral[0])} or nothing, got {shown(value)}; stages that "
+        "are moved, turned or scaled are not supported, because versions of Habitat-Sim differ in it: change the mesh"
+    )
+
+
+def inside(target: Path, root: Path, told_by: str, value: str) -> Path:
+    """The same path, when it does not leave the data set.
+
+    Absolute paths are judged by the same rule. Links are followed first, so that a link cannot lead outside either.
+
+    Raises:
+        SceneError: it lies outside of `root`.
+    """
+    # No file system takes the null character, and asking about one is an error of its own.
+    if "\0" in value or not target.resolve().is_relative_to(root.resolve()):
+        raise SceneError(f"{told_by}: {value!r} lies outside of {root}, the folder of its data")
+    return target
+
+
+def shown(value: Any) -> str:
+    """A JSON value in one short line."""
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _asset(layers: Sequence[Layer], folder: Path, root: Path, name: str) -> Path:
+    value, layer = find(layers, "render_asset")
+    key = f"{layer.path}: {layer.where}render_asset"
+    if not isinstance(value, str) or not value:
+        raise SceneError(f"{key}: expected the path of a mesh ({', '.join(SUFFIXES)}), got {shown(value)}")
+    asset = inside(folder / value.replace(_FILE_NAME_TAG, name), root, key, value)
+    if asset.suffix.lower() not in SUFFIXES:
+        raise SceneError(f"{key}: expected a mesh ({', '.join(SUFFIXES)}), got {shown(value)}")
+    if not os.path.isfile(asset):
+        raise SceneError(f"{key}: there is no file {asset}")
+    return asset
+
+
+def _axes(layers: Sequence[Layer], default: Axes) -> Axes:
+    if all(find(layers, key)[0] is None for key in ("up", "front")):
+        return default
+    # A config that names one of them gets the other as Habitat-Sim has it, whatever its asset is.
+    (up, layer), (front, _) = (_direction(layers, key, Y_UP[index]) for index, key in enumerate(("up", "front")))
+    if abs(sum(a * b for a, b in zip(up, front, strict=True))) > 1e-5:
+        raise SceneError(
+            f"{layer.path}: {layer.where}up and front: expected two directions at right angles, got "
+            f"up {shown(list(up))} and front {shown(list(front))}; name both"
+        )
+    if _is_turned_over(up, front):
+        raise SceneError(
+            f"{layer.path}: {layer.where}up and front: Habitat-Sim shows a stage with up {shown(list(up))} and front "
+            f"{shown(list(front))} upside down; expected another front, {shown([-item or 0.0 for item in front])} say"
+        )
+    return up, front
+
+
+def _is_turned_over(up: Vector, front: Vector) -> bool:
+    """Whether Habitat-Sim's frame of these axes has its up pointing down.
+
+    It takes +Y to `up` by the shortest turn, then -Z, as turned by that, to `front` (CoordinateFrame in its sources).
+    When these two are opposite, the half turn between them is made about an axis at right angles to +Y (Quaternion in
+    Magnum's), which is `up` only if `up` is at right angles to +Y.
+    """
+    share = up[2] / (1.0 + up[1]) if up[1] > -1.0 else 0.0
+    before = (share * up[0], share * (1.0 + up[1]), share * up[2] - 1.0)
+    return sum(a * b for a, b in zip(before, front, strict=True)) < -1.0 + 2e-5 and abs(up[1]) > 1e-5
+
+
+def _direction(layers: Sequence[Layer], key: str, default: Vector) -> tuple[Vector, Layer]:
+    value, layer = find(layers, key)
+    if value is None:
+        return default, layer
+    if not isinstance(value, list) or len(value) != 3 or not all(_is_number(item) for item in value):
+        raise SceneError(f"{layer.path}: {layer.where}{key}: expected three numbers, got {shown(value)}")
+    length = math.hypot(*value)
+    if not 0 < length < math.inf:
+        raise SceneError(f"{layer.path}: {layer.where}{key}: expected a direction, got {shown(value)}")
+    return (value[0] / length, value[1] / length, value[2] / length), layer
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
