@@ -25,3 +25,16 @@ def quiet_threads() -> None:
 def own_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Tables of scenes that tests make do not fill the user's cache."""
     os.environ["AVP_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests of Habitat-Sim are skipped where it cannot be loaded, for the reason that its users would read."""
+    from avp_habitat.errors import SimulatorError
+    from avp_habitat.simulators.habitat.installed import require_installed
+
+    try:
+        require_installed()
+    except SimulatorError as error:
+        for item in items:
+            if item.get_closest_marker("habitat"):
+                item.add_marker(pytest.mark.skip(reason=str(error)))

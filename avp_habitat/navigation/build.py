@@ -100,33 +100,53 @@ def _with_floor(
     return _over_cells(rings, origin, mask, top, surface_below, settings)
 
 
-def area_in_outline(triangles: Float, surface_below: SurfaceBelow, settings: NavigationSettings) -> NavigableArea:
+def area_in_outline(
+    triangles: Float, surface_below: SurfaceBelow, settings: NavigationSettings, bounds: Float | None = None
+) -> NavigableArea:
     """The navigable area of a navigation mesh that was made elsewhere, on the scene's true floor.
 
     Args:
         triangles: `(k, 3, 3)` corners in metres, world frame, of one connected navigation mesh; heights may lie above
             the floor by what their maker rounded up.
-        surface_below: casts rays straight down on the scene's mesh.
+        surface_below: finds the scene's first surface straight below points, which come on few different heights.
         settings: of the cells.
+        bounds: `(2, 3)` least and greatest corner of the scene's mesh in metres: cells then lie where `build` lays
+            them; without, they begin at the outline.
 
     Raises:
         SceneError: the mesh is smaller than one cell, or no ray meets the floor.
     """
     import shapely
-    from scipy.spatial import KDTree
 
-    shapes = shapely.polygons(triangles[:, :, [0, 2]])
+    shapes = np.asarray(shapely.polygons(triangles[:, :, [0, 2]]))
     # Neighbours share corners only up to rounding; a seam would cut the area in two.
     rings = largest_piece(shapely.union_all(shapely.buffer(shapes, SKIN_M, join_style="mitre")))
     low, high = rings[0].min(axis=0), rings[0].max(axis=0)
+    if bounds is not None:
+        low, high = bounds[0, [0, 2]] + (settings.voxel_m - settings.cell_m) / 2, np.maximum(high, bounds[1, [0, 2]])
     columns, rows = np.ceil((high - low) / settings.cell_m).astype(int)
     x = low[0] + (np.arange(columns) + 0.5) * settings.cell_m
     z = low[1] + (np.arange(rows) + 0.5) * settings.cell_m
     centres = np.stack(np.meshgrid(x, z), axis=-1)
     mask = _stands_clear(make_walls(rings), centres.reshape(-1, 2)).reshape(rows, columns)
-    corners = triangles.reshape(-1, 3)
-    nearest = KDTree(corners[:, [0, 2]]).query(centres[mask])[1] if mask.any() else []
-    return _over_cells(rings, low, mask, corners[nearest, 1], surface_below, settings)
+    floor = _height_on(triangles, shapes, centres[mask])
+    # On half voxels, so that a slope is asked about on few heights.
+    step = settings.voxel_height_m / 2
+    return _over_cells(rings, low, mask, np.ceil(floor / step - 1e-6) * step, surface_below, settings)
+
+
+def _height_on(triangles: Float, shapes: NDArray, points: Float) -> Float:
+    """`(n,)` heights of `(k, 3, 3)` triangles, seen from above as `shapes`, at the `(n, 2)` points next to them."""
+    import shapely
+
+    at = shapely.STRtree(shapes).nearest(shapely.points(points))
+    a, b, c = (triangles[at, corner] for corner in range(3))
+    ab, ac, ap = (b - a)[:, [0, 2]], (c - a)[:, [0, 2]], points - a[:, [0, 2]]
+    doubled = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
+    doubled = np.where(np.abs(doubled) > 1e-12, doubled, np.inf)
+    right = (ap[:, 0] * ac[:, 1] - ap[:, 1] * ac[:, 0]) / doubled
+    up = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / doubled
+    return a[:, 1] + right * (b - a)[:, 1] + up * (c - a)[:, 1]
 
 
 def _over_cells(

@@ -1,0 +1,124 @@
+"""Habitat-Sim as a simulator of the suite: its renderer and its NavMesh, on the CPU or a GPU."""
+
+import tempfile
+import weakref
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.coverage import visible_in_depth
+from avp_habitat.errors import SceneError
+from avp_habitat.navigation.area import NavigableArea
+from avp_habitat.poses import Intrinsics
+from avp_habitat.scenes.loader import scene_digest
+from avp_habitat.scenes.location import SceneLocation, locate
+from avp_habitat.simulators.base import Frames
+from avp_habitat.simulators.habitat import process
+from avp_habitat.simulators.habitat.graphics import choose_gpu
+from avp_habitat.simulators.habitat.installed import require_installed
+from avp_habitat.simulators.habitat.stage import write_stage
+
+if TYPE_CHECKING:
+    from avp_habitat.simulators.habitat.engine import HabitatEngine
+
+_COVERAGE_CAMERA = Intrinsics.from_hfov(640, 480, hfov_deg=90.0)
+
+
+class HabitatSimulator:
+    """One Habitat-Sim simulator; a process can hold only one, and it is no use to processes forked from it."""
+
+    name = "habitat"
+
+    def __init__(self, scene: str, *, gpu: int | None = None, navmesh: str | Path | None = None) -> None:
+        """Open a scene.
+
+        What ends the process inside Habitat-Sim (a second simulator, a missing CUDA device, no EGL, no NavMesh) is
+        caught here before it happens.
+
+        Args:
+            scene: a mesh file, a folder of Replica, a stage config, `NAME.scene_dataset_config.json:ID`, or
+                `builtin:SEED`; see `avp_habitat.scenes.location.locate`.
+            gpu: CUDA device that renders; -1 for none; None for the first one that EGL offers, if any.
+            navmesh: a `.navmesh` file; without it the NavMesh is computed for the design's agent.
+
+        Raises:
+            UsageError: an option that cannot be right.
+            SimulatorError: habitat-sim or a graphics device is missing, or this process holds a simulator already.
+            SceneError: the scene or the NavMesh cannot be read, or nobody can stand in it.
+        """
+        require_installed()
+        device = choose_gpu(gpu)
+        location = locate(scene)
+        path = _navmesh_file(navmesh)
+        self.scene, self.scene_digest = location.name, scene_digest(location)
+        self._engine = _open(location, device)
+        self._closing = weakref.finalize(self, _close, self._engine)
+        self.version = self._engine.version
+        try:
+            from avp_habitat.simulators.habitat.navmesh import navmesh_area
+
+            self._area = navmesh_area(self._engine, path)
+        except BaseException as error:
+            self.close()
+            if isinstance(error, SceneError):
+                raise SceneError(f"{self.scene}: {error}") from error
+            raise
+
+    @property
+    def area(self) -> NavigableArea:
+        """The largest island of Habitat's NavMesh, recomputed for the design's agent unless a file was given."""
+        return self._area
+
+    def render(self, camera_to_world: NDArray[np.floating], intrinsics: Intrinsics, *, rgb: bool) -> Frames:
+        """Depth, and colour when asked for, of `(n, 4, 4)` habitat poses; see `simulators.base.Simulator.render`."""
+        process.check_process(self.scene)
+        return self._engine.render(camera_to_world, intrinsics, rgb=rgb)
+
+    def visible(
+        self,
+        camera_to_world: NDArray[np.floating],
+        points: NDArray[np.floating],
+        pairs: NDArray[np.integer],
+        *,
+        tolerance_m: float,
+    ) -> NDArray[np.bool_]:
+        """Whether camera rays reach points, from depth images; see `simulators.base.Simulator.visible`."""
+        asked, camera = np.unique(pairs[:, 0], return_inverse=True)
+        poses = np.asarray(camera_to_world)[asked]
+        depth = self.render(poses, _COVERAGE_CAMERA, rgb=False).depth
+        among = np.stack([camera.reshape(-1), pairs[:, 1]], axis=1)
+        return visible_in_depth(poses, _COVERAGE_CAMERA, depth, points, among, tolerance_m=tolerance_m)
+
+    def close(self) -> None:
+        """Free the simulator and its graphics context; another one can then be opened in this process."""
+        self._closing()
+
+
+def _open(location: SceneLocation, gpu: int) -> "HabitatEngine":
+    process.claim(location.name)
+    try:
+        process.import_before_graphics()
+        from avp_habitat.simulators.habitat.engine import HabitatEngine
+
+        with tempfile.TemporaryDirectory(prefix="avp-habitat-") as folder:
+            return HabitatEngine(*write_stage(location, Path(folder)), gpu=gpu)
+    except BaseException:
+        process.release()
+        raise
+
+
+def _close(engine: "HabitatEngine") -> None:
+    # A forked child inherits the object, but must leave alone what its parent still uses.
+    if process.release():
+        engine.close()
+
+
+def _navmesh_file(navmesh: str | Path | None) -> Path | None:
+    if navmesh is None:
+        return None
+    path = Path(navmesh)
+    if not path.is_file():
+        raise SceneError(f"{path}: no such NavMesh file (.navmesh)")
+    return path
