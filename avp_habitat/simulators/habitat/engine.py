@@ -25,7 +25,7 @@ from avp_habitat.errors import SceneError, SimulatorError
 from avp_habitat.navigation.settings import NavigationSettings
 from avp_habitat.poses import Intrinsics
 from avp_habitat.simulators.base import Frames
-from avp_habitat.simulators.habitat.installed import explain_import_error
+from avp_habitat.simulators.habitat.installed import cannot_load
 
 _NO_IMAGE = "no-image-based-lighting"
 _CLONE_FS = 0x200
@@ -303,5 +303,5 @@ def _import_habitat() -> Any:
         import magnum  # noqa: F401 # pyright: ignore[reportMissingImports] - has to come before habitat_sim
         import habitat_sim  # isort: skip # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise SimulatorError(explain_import_error(error)) from error
+        raise SimulatorError(cannot_load(error)) from error
     return habitat_sim
