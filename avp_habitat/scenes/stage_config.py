@@ -1,4 +1,8 @@
-"""Habitat-Sim's stage configs: the mesh that a stage shows, and the axes of that mesh."""
+"""Habitat-Sim's stage configs: the mesh that a stage shows, and the axes of that mesh.
+
+What a config means is followed, for every kind of mesh. Version 0.3.4 itself turns a `.glb` so, but shows a `.ply` or
+`.obj` as it lies, whatever its axes, and without vertex colours (ResourceManager::loadRenderAssetGeneral).
+"""
 
 import json
 import math
@@ -83,9 +87,9 @@ def read_stage(layers: Sequence[Layer], folder: Path, root: Path, *, name: str, 
     asset = _asset(layers, folder, root, name)
     up, front = _axes(layers, axes)
     if asset.name.endswith("_semantic.ply") and find(layers, "render_asset_type")[0] in (None, "semantic"):
-        # Habitat-Sim takes a mesh of such a name for one with semantic labels, and turns it from Z-up to Y-up before
-        # it applies the config's axes (GenericSemanticMeshData in its sources).
-        up, front = (up[0], 0.0 - up[2], up[1]), (front[0], 0.0 - front[2], front[1])
+        # Habitat-Sim takes a mesh of such a name for one with semantic labels, and after it has applied the config's
+        # axes, it turns the mesh from Z-up to Y-up (ResourceManager and GenericSemanticMeshData in its sources).
+        up, front = (0.0 - front[0], 0.0 - front[1], 0.0 - front[2]), up
     return Stage(asset, (up, front))
 
 
