@@ -53,7 +53,7 @@ class HabitatSimulator:
         location = locate(scene)
         path = _navmesh_file(navmesh)
         self.scene, self.scene_digest = location.name, scene_digest(location)
-        self._engine = _open(location, device)
+        self._engine = _open(scene, location, device)
         self._closing = weakref.finalize(self, _close, self._engine)
         self.version = self._engine.version
         try:
@@ -96,14 +96,14 @@ class HabitatSimulator:
         self._closing()
 
 
-def _open(location: SceneLocation, gpu: int) -> "HabitatEngine":
+def _open(scene: str, location: SceneLocation, gpu: int) -> "HabitatEngine":
     process.claim(location.name)
     try:
         process.import_before_graphics()
         from avp_habitat.simulators.habitat.engine import HabitatEngine
 
         with tempfile.TemporaryDirectory(prefix="avp-habitat-") as folder:
-            return HabitatEngine(*write_stage(location, Path(folder)), gpu=gpu)
+            return HabitatEngine(*write_stage(scene, location, Path(folder)), gpu=gpu)
     except BaseException:
         process.release()
         raise
