@@ -10,11 +10,12 @@ from typing import Any, SupportsFloat
 import gymnasium
 
 from avp_habitat.env import AVPEnv
-from avp_habitat.errors import UsageError
+from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.heldout import VIEWS
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout_capture import capture_heldout, capture_step, publish_rollout
 from avp_habitat.rollout_writer import RolloutWriter
+from avp_habitat.worker_env import UnopenedEnv, in_sb3_worker
 
 _PICTURE = (640, 480)
 
@@ -132,11 +133,18 @@ def make_env(*, record: str | Path | None = None, record_options: dict[str, Any]
 
     Raises:
         UsageError: as `AVPEnv` and `RecordRollout`, or options for a recording without a folder.
+        SceneError: as `AVPEnv`.
+        SimulatorError: as `AVPEnv`. In a worker of `SubprocVecEnv` all errors wait in an `UnopenedEnv`.
     """
-    if record is None and record_options:
-        raise UsageError("record_options: expected a folder as `record` with them, got none")
-    env = AVPEnv(**kwargs)
-    return env if record is None else RecordRollout(env, record, **(record_options or {}))
+    try:
+        if record is None and record_options:
+            raise UsageError("record_options: expected a folder as `record` with them, got none")
+        env = AVPEnv(**kwargs)
+        return env if record is None else RecordRollout(env, record, **(record_options or {}))
+    except AVPError as error:
+        if not in_sb3_worker():
+            raise
+        return UnopenedEnv(error, **kwargs)
 
 
 # Gymnasium reads the render modes from the entry point.

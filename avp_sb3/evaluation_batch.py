@@ -16,40 +16,12 @@ from avp_habitat.trajectory import Trajectory
 from avp_sb3.evaluation import COVERAGE_AFTER, KEPT, episode_figures
 from avp_sb3.evaluation_fit import normaliser
 from avp_sb3.finished_episodes import required
-from avp_sb3.vec_env import AVPVecEnv
 
 READER = "EvaluationCallback"
 """Who needs what an environment reports, for the errors' texts."""
 _OF_BUDGET = ("coverage_area", *(f"coverage_at_{views}" for views in COVERAGE_AFTER))
 FIGURES = (*KEPT, "redundant_share", "return", "cpv", *_OF_BUDGET)
 """Everything that an evaluation may log, below `eval/`."""
-
-
-class FixedStarts(AVPVecEnv):
-    """One agent for each episode in each of some scenes; seeded, episode i of every scene starts from `seed + i`."""
-
-    def __init__(self, scenes: Sequence[str], *, episodes: int, simulator: str, settings: TaskSettings) -> None:
-        """Open the scenes.
-
-        Args:
-            scenes: mesh files or `builtin:SEED`.
-            episodes: in each scene.
-            simulator: the simulator's name.
-            settings: of the task.
-
-        Raises:
-            UsageError: more agents than memory allows, or an unknown name.
-            SceneError: a scene cannot be used.
-            SimulatorError: the simulator cannot run here.
-        """
-        super().__init__(list(scenes), agents=episodes * len(scenes), simulator=simulator, settings=settings)
-
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed the starts of the next `reset`."""
-        if seed is not None:
-            # Agent i is in scene i modulo their number.
-            self._seeds = [seed + row // len(self.simulators) for row in range(self.num_envs)]
-        return self._seeds
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """The policy of a running training on other scenes: figures, pictures, and the best model kept."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,13 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from avp_habitat.errors import UsageError, unknown_name
 from avp_habitat.settings import TaskSettings
+from avp_habitat.simulators import SimulatorChoice
 from avp_sb3.best_model import WHEN, BestModel, statistics_of
-from avp_sb3.evaluation_batch import FIGURES, READER, BatchEpisode, FixedStarts, means, run_batch, scenes_of
+from avp_sb3.evaluation_batch import FIGURES, READER, BatchEpisode, means, run_batch, scenes_of
 from avp_sb3.evaluation_fit import check_fit, normalised_like
 from avp_sb3.evaluation_picture import evaluation_picture
 from avp_sb3.finished_episodes import MissingInfoError
+from avp_sb3.fixed_starts import fixed_starts
 from avp_sb3.learning import is_learning
 from avp_sb3.logged_file import NOT_FOR, LoggedFile
 from avp_sb3.own_dump import logged_alone, move_to_front
@@ -62,6 +65,8 @@ class EvaluationCallback(BaseCallback):
         best_model: str | Path | None = f"runs/best-{WHEN}.zip",
         settings: TaskSettings | None = None,
         simulator: str = "raycast",
+        gpu: int | None = None,
+        navmesh: str | Path | None = None,
         verbose: int = 0,
     ) -> None:
         """Describe the evaluation; scenes are opened when the training starts.
@@ -83,7 +88,9 @@ class EvaluationCallback(BaseCallback):
             best_model: file of the best model; `DATE-TIME` in its name becomes when the training started; None keeps
                 none. A file that exists is refused unless the training that made it goes on.
             settings: of the task; those of the training's environment when omitted, also whether views are looked up.
-            simulator: that opens the scenes.
+            simulator: that opens the scenes; with `habitat` each of them is in a process of its own.
+            gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
+            navmesh: file of the only scene's NavMesh for `habitat`; computed when omitted.
             verbose: 1 prints when a better model is kept.
 
         Raises:
@@ -100,7 +107,7 @@ class EvaluationCallback(BaseCallback):
         self._agents: dict[str, list[int]] = {}
         self._every, self._episodes, self._seed = every, episodes, seed
         self._deterministic, self._at_start, self._score = deterministic, at_start, score
-        self._settings, self._simulator = settings, simulator
+        self._settings, self._choice = settings, SimulatorChoice.of(simulator, gpu=gpu, navmesh=navmesh)
         self._best = BestModel(best_model, score)
         self._due = 0
         self._evaluated_at: int | None = None
@@ -116,6 +123,7 @@ class EvaluationCallback(BaseCallback):
         return self._best.value
 
     def _on_training_start(self) -> None:
+        self._close()
         with own_random_state(self.model, self._seed):
             self._env = self._open() if self._given is None else self._given
         check_fit(self.model, self.training_env, self._env, reader=READER)
@@ -141,6 +149,11 @@ class EvaluationCallback(BaseCallback):
         self.num_timesteps = self.model.num_timesteps
         if is_learning(self.model) and self._evaluated_at != self.num_timesteps:
             self._evaluate()
+        self._close()
+
+    def _close(self) -> None:
+        if self._given is None and self._env is not None:
+            self._env.close()
 
     def _plan_next(self) -> None:
         self._due = (self.num_timesteps // self._every + 1) * self._every
@@ -155,7 +168,9 @@ class EvaluationCallback(BaseCallback):
                     f"{READER}: the training's environment has no settings of AVP-v0 to evaluate with; expected "
                     "settings, or an eval_env of its own kind"
                 )
-        return FixedStarts(self._scenes, episodes=self._episodes, simulator=self._simulator, settings=settings)
+            # Only rays can be looked up.
+            settings = replace(settings, lookup=settings.lookup and self._choice.name == "raycast")
+        return fixed_starts(self._scenes, self._choice, episodes=self._episodes, settings=settings)
 
     def _evaluate(self) -> None:
         assert self._env is not None

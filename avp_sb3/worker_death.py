@@ -53,7 +53,7 @@ def _join(processes: Sequence[BaseProcess]) -> None:
 
 @contextmanager
 def named_deaths(
-    processes: Sequence[BaseProcess], name: Callable[[int], str], end: Callable[[], None]
+    processes: Sequence[BaseProcess], name: Callable[[int], str], end: Callable[[], None], *, hint: str = ""
 ) -> Iterator[None]:
     """Within the block, a broken pipe becomes an error that names the worker; the others are ended, too.
 
@@ -61,6 +61,7 @@ def named_deaths(
         processes: the workers.
         name: of a worker by its number, for the error's text.
         end: ends them all.
+        hint: at the end of the error's text.
 
     Raises:
         SimulatorError: a worker has ended.
@@ -73,7 +74,7 @@ def named_deaths(
         with suppress(OSError):
             end()
         who = "" if dead is None else f"{name(dead)} "
-        raise SimulatorError(f"{who}{how}; the other workers were ended") from None
+        raise SimulatorError(f"{who}{how}; the other workers were ended{hint}") from None
 
 
 def _first_dead(processes: Sequence[BaseProcess]) -> int | None:

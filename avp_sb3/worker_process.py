@@ -9,7 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from avp_habitat.errors import AVPError
+from avp_habitat import errors
+from avp_habitat.errors import AVPError, SimulatorError
 from avp_habitat.settings import TaskSettings
 from avp_habitat.simulators.options import SimulatorChoice
 
@@ -42,6 +43,19 @@ class Failure:
     text: str
     """Of the exception."""
 
+    def error(self, worker: str) -> Exception:
+        """The same as an exception of this process: one of ours as it was, another one as a `SimulatorError`.
+
+        Args:
+            worker: what the worker is called.
+        """
+        if self.kind == "AttributeError":
+            return AttributeError(self.text)
+        kind = getattr(errors, self.kind, None)
+        if isinstance(kind, type) and issubclass(kind, AVPError):
+            return kind(f"{self.text} [{worker}]")
+        return SimulatorError(f"{worker}: {self.kind}: {self.text}")
+
 
 def serve(pipe: "Connection", order: Order) -> None:
     """Open the scene, then answer requests until the pipe is closed.
@@ -57,7 +71,7 @@ def serve(pipe: "Connection", order: Order) -> None:
         pipe.send((0, ready))
         while opened:
             ticket, name, arguments = pipe.recv()
-            _answer(pipe, ticket, _attempt(lambda: _COMMANDS[name](opened[0], *arguments)))  # noqa: B023
+            _answer(pipe, ticket, name, _attempt(lambda: _COMMANDS[name](opened[0], *arguments)))  # noqa: B023
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # The parent has closed its end, or is gone.
     finally:
@@ -95,13 +109,13 @@ def _attempt(work: Callable[[], Any]) -> Any:
         return Failure(type(error).__name__, f"{error} (process {os.getpid()}; its traceback stands above)")
 
 
-def _answer(pipe: "Connection", ticket: int, value: Any) -> None:
+def _answer(pipe: "Connection", ticket: int, name: str, value: Any) -> None:
     try:
         pipe.send((ticket, value))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         raise
     except Exception as error:  # Pickle raises whatever the object's own code raises.
-        text = f"{type(value).__name__} cannot leave the process of its simulator: {error}"
+        text = f"{name}: the answer cannot leave the process of its simulator: {error}"
         pipe.send((ticket, Failure("UsageError", text)))
 
 

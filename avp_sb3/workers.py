@@ -6,12 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from avp_habitat import errors
-from avp_habitat.errors import AVPError, SimulatorError, UsageError
+from avp_habitat.errors import SimulatorError, UsageError
 from avp_sb3.worker_death import end_processes, named_deaths
 from avp_sb3.worker_process import Failure, Order, serve
 
 START_METHODS = ("forkserver", "spawn")
+_GUARD = '; a script that starts workers needs the guard `if __name__ == "__main__":`, because they import it'
 
 
 class Workers:
@@ -102,20 +102,12 @@ class Workers:
                         continue  # To a request whose asker was interrupted.
                     worker = waiting.pop(pipe)  # type: ignore[arg-type]
                     if isinstance(value, Failure):
-                        raise self._error(worker, value)
+                        raise value.error(self._name(worker))
                     answers[worker] = value
         return answers
 
     def _deaths(self) -> Any:
-        return named_deaths(self.processes, self._name, self.close)
+        return named_deaths(self.processes, self._name, self.close, hint="" if self._ticket else _GUARD)
 
     def _name(self, worker: int) -> str:
         return f"worker {worker} of {len(self._orders)} (scene {self._orders[worker].scene})"
-
-    def _error(self, worker: int, failure: Failure) -> Exception:
-        if failure.kind == "AttributeError":
-            return AttributeError(failure.text)
-        kind = getattr(errors, failure.kind, None)
-        if isinstance(kind, type) and issubclass(kind, AVPError):
-            return kind(f"{failure.text} [{self._name(worker)}]")
-        return SimulatorError(f"{self._name(worker)}: {failure.kind}: {failure.text}")

@@ -7,13 +7,14 @@ from pathlib import Path
 import gymnasium
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
 from avp_habitat.env import AVPEnv
 from avp_habitat.errors import UsageError
 from avp_habitat.settings import TaskSettings
 from avp_habitat.simulators import Simulator, make_simulator
 from avp_sb3.vec_env import AVPVecEnv
+from avp_sb3.zoo_processes import WatchedProcesses
 
 _REPLACED = (Monitor, OrderEnforcing, PassiveEnvChecker)
 """Wrappers whose work the batch does itself, or does not need."""
@@ -24,8 +25,9 @@ _HOOK = "avp_sb3.zoo.Batched"
 def Batched(venv: VecEnv, *, scenes: Sequence[str] = (), lookup: bool = True) -> VecEnv:
     """The same agents as one `AVPVecEnv` within a `VecMonitor`: same scenes, settings and starts, stepped as arrays.
 
-    Left as they are: environments in processes of their own (`--vec-env subproc`), and those that are rendered,
-    recorded or wrapped otherwise, because a batch would leave that out.
+    Left as they are: those that are rendered, recorded or wrapped otherwise, because a batch would leave that out, and
+    environments in processes of their own (`--vec-env subproc`). The latter are watched: a worker that fails or ends
+    is one error that names its scene (`zoo_processes.WatchedProcesses`).
 
     Args:
         venv: what rl_zoo3 made.
@@ -37,9 +39,13 @@ def Batched(venv: VecEnv, *, scenes: Sequence[str] = (), lookup: bool = True) ->
         UsageError: an environment is no `AVPEnv`, their settings differ, they are fewer than the scenes, or there are
             scenes for environments that are left as they are.
         SceneError: one of the scenes cannot be used.
+        SimulatorError: a simulator cannot run here, or a worker ended.
     """
+    if isinstance(venv, SubprocVecEnv):
+        print(f"{_HOOK}: the environments are stepped one by one: they are in processes of their own")
+        return WatchedProcesses(venv, scenes if venv.num_envs > 1 else (), reader=_HOOK)
     if not isinstance(venv, DummyVecEnv):
-        return _left_alone(venv, "they are in processes of their own", scenes)
+        return _left_alone(venv, f"they are a {type(venv).__name__}", scenes)
     envs = [_avp_env(env) for env in venv.envs]
     if (reason := _reason_to_leave(venv.envs)) is not None:
         return _left_alone(venv, reason, scenes)

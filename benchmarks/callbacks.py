@@ -159,8 +159,9 @@ class _Bench:
 
     def first_evaluation(self) -> dict[str, Any]:
         """CPU seconds of the default evaluation: opening its scene, the first time in it, and later ones."""
-        from avp_sb3.evaluation_batch import FixedStarts, run_batch
+        from avp_sb3.evaluation_batch import run_batch
         from avp_sb3.evaluation_callback import DEFAULT_EPISODES, DEFAULT_EVERY, DEFAULT_SCENES
+        from avp_sb3.fixed_starts import FixedStarts
 
         model, seconds = self.model(self.options.seed), []
         start = time.process_time()

@@ -36,9 +36,10 @@ from avp_habitat.errors import SceneError, UsageError
 from avp_habitat.settings import TaskSettings
 from avp_sb3 import AVPVecEnv, EvaluationCallback, MetricsCallback, MLflowCallback, evaluate_policy
 from avp_sb3.best_model import BestModel, BestModelError
-from avp_sb3.evaluation_batch import FixedStarts, means, run_batch, scenes_of
+from avp_sb3.evaluation_batch import means, run_batch, scenes_of
 from avp_sb3.evaluation_picture import draw_curves, evaluation_picture
 from avp_sb3.finished_episodes import MissingInfoError
+from avp_sb3.fixed_starts import FixedStarts
 from avp_sb3.logged_file import LoggedFile
 
 ROOMS = ("builtin:1", "builtin:2")

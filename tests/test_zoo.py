@@ -21,7 +21,7 @@ from tracking import mlflow_home
 from avp_habitat import command
 from avp_habitat.collect import main as collect
 from avp_habitat.env import AVPEnv
-from avp_habitat.errors import SceneError, UsageError
+from avp_habitat.errors import SceneError, SimulatorError, UsageError
 from avp_habitat.rollout import read_rollout
 from avp_sb3 import hyperparams, zoo
 from avp_sb3.vec_env import AVPVecEnv
@@ -127,14 +127,81 @@ def test_environments_that_cannot_be_batched_are_refused_in_one_line():
 
 
 @pytest.mark.slow
-def test_processes_give_the_same_numbers_and_are_left_alone(capsys):
+def test_processes_give_the_same_numbers_and_take_turns_in_the_given_scenes(capsys):
     processes = zoo_envs(2, vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "forkserver"})
+    watched = zoo.Batched(processes)
     try:
-        assert zoo.Batched(processes) is processes
+        assert watched.venv is processes
         assert "in processes of their own" in capsys.readouterr().out
-        assert_same_walk(processes, zoo_envs(2))
+        assert_same_walk(watched, zoo_envs(2))
     finally:
-        processes.close()
+        watched.close()
+    scenes = ["builtin:1", "builtin:2"]
+    watched = zoo.Batched(zoo_envs(2, vec_env_cls=SubprocVecEnv), scenes=scenes)
+    try:
+        assert watched.get_attr("scene_name") == watched.venv.get_attr("scene_name") == scenes
+        assert_same_walk(watched, zoo.Batched(zoo_envs(2), scenes=scenes, lookup=False))
+    finally:
+        watched.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "scenes", "error"),
+    [
+        ({"scene": "gone.glb"}, [], r"gone\.glb: no such scene file.* \[worker 0 of 2\]"),
+        ({"reward": "cover"}, [], r"unknown reward 'cover'.* \[worker 0 of 2\]"),
+        ({}, ["builtin:1", "gone.glb"], r"gone\.glb: no such scene file"),
+        ({}, ["builtin:1", "builtin:2", "builtin:3"], "one environment for each of the 3 scenes, got 2"),
+    ],
+)
+def test_what_fails_in_a_process_is_one_error_of_the_parent(changes, scenes, error):
+    processes = zoo_envs(2, vec_env_cls=SubprocVecEnv, **changes)
+    with pytest.raises((SceneError, UsageError), match=error):
+        zoo.Batched(processes, scenes=scenes)
+    assert [process.exitcode for process in processes.processes] == [0, 0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("line", "last", "processes_say"),
+    [
+        ("zoo.Batched(venv)", "avp_habitat.errors.SceneError: gone.glb: no such scene file", []),
+        ("venv.reset()", "EOFError", ["error: gone.glb: no such scene file"] * 2),
+    ],
+)
+def test_processes_without_a_scene_end_in_one_line_at_most(tmp_path, line, last, processes_say):
+    code = f"""
+import avp_habitat, gymnasium
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
+from avp_sb3 import zoo
+spec = gymnasium.spec(avp_habitat.ENV_ID)
+venv = make_vec_env(spec.make, n_envs=2, env_kwargs={{"scene": "gone.glb"}}, vec_env_cls=SubprocVecEnv)
+try:
+    {line}
+finally:
+    for process in venv.processes:
+        process.join(5)
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    told = done.stderr.splitlines()
+    assert told[-1].startswith(last)
+    own = told[: told.index("Traceback (most recent call last):")]
+    assert [text.partition(" (")[0] for text in own] == processes_say
+    assert done.stderr.count("Process ForkServerProcess") == 0, "that is how a traceback of a process begins"
+
+
+@pytest.mark.slow
+def test_a_killed_process_is_named_with_its_scene_and_the_others_are_ended():
+    watched = zoo.Batched(zoo_envs(2, vec_env_cls=SubprocVecEnv))
+    watched.reset()
+    os.kill(watched.venv.processes[1].pid, signal.SIGKILL)
+    with pytest.raises(SimulatorError, match=r"worker 1 of 2 \(scene builtin:0\) was killed by SIGKILL"):
+        walk(watched)
+    assert [process.exitcode for process in watched.venv.processes] == [0, -9]
+    assert watched.get_attr("area", [1])[0].area_m2 > 1, "an interrupted run is still drawn"
+    watched.close()
 
 
 @pytest.fixture
