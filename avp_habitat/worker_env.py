@@ -46,7 +46,7 @@ class UnopenedEnv(gymnasium.Env):
         self.observation_space = observation_space(kind if kind in OBSERVATION_NAMES else OBSERVATION_NAMES[0])
         self.action_space = action_space()
 
-    def reset(self, **_: Any) -> NoReturn:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> NoReturn:
         """End the process.
 
         Raises:
@@ -54,4 +54,6 @@ class UnopenedEnv(gymnasium.Env):
         """
         raise SystemExit(f"error: {self.failure[1]}")
 
-    step = reset  # type: ignore[assignment]
+    def step(self, action: Any) -> NoReturn:
+        """As `reset`."""
+        self.reset()

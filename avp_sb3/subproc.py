@@ -193,5 +193,6 @@ def _workers(workers: int | None, scenes: int) -> int:
     if workers is None:
         return scenes
     if workers < 1 or workers % scenes:
-        raise UsageError(f"workers: expected {scenes} or a multiple of it, as there are {scenes} scenes, got {workers}")
+        there_are = "there is 1 scene" if scenes == 1 else f"there are {scenes} scenes"
+        raise UsageError(f"workers: expected {scenes} or a multiple of it, as {there_are}, got {workers}")
     return workers

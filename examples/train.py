@@ -12,6 +12,8 @@ from typing import Any
 from avp_habitat import command
 from avp_habitat.errors import UsageError, unknown_name
 from avp_habitat.settings import OBSERVATION_NAMES, TaskSettings
+from avp_habitat.simulators import ONE_PER_PROCESS, SimulatorChoice
+from avp_habitat.simulators.options import add_simulator_options, simulator_choice
 from avp_sb3.presets import PRESETS, Preset
 
 _MLFLOW = "runs:/"
@@ -25,6 +27,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--observation", default="numbers", help="numbers (the paper's twelve) or map; also chooses PPO's settings")
     add("--steps", default=300_000, type=int, help="environment steps in total")
     add("--agents", default=None, type=int, help="agents stepped as one batch; the settings' own when omitted")
+    add("--workers", default=None, type=int, help="processes with a simulator each, a multiple of the scenes' number")
+    add_simulator_options(parser)
     add("--rays", action="store_true", help="cast all rays instead of looking views up in the scenes' tables")
     add("--width", default=160, type=int, help="of the policy's depth image in pixels")
     add("--height", default=120, type=int, help="of the policy's depth image in pixels")
@@ -58,6 +62,26 @@ def _preset(options: argparse.Namespace) -> Preset:
     if agents < 1 or buffer % agents:
         raise UsageError(f"--agents: expected a divisor of PPO's buffer of {buffer} steps, got {agents}")
     return replace(preset, n_envs=agents, n_steps=buffer // agents)
+
+
+def _environment(options: argparse.Namespace, preset: Preset, choice: SimulatorChoice) -> Any:
+    """The agents in this process, or in several: when asked for, and where each scene needs its own simulator."""
+    from stable_baselines3.common.vec_env import VecMonitor
+
+    from avp_sb3 import AVPSubprocVecEnv, AVPVecEnv
+
+    settings = TaskSettings(
+        reward=options.reward,
+        observation=options.observation,
+        lookup=not options.rays and choice.name == "raycast",
+        width=options.width,
+        height=options.height,
+    )
+    common = {"agents": preset.n_envs, "settings": settings, "seed": options.seed}
+    common |= {"simulator": choice.name, "gpu": choice.gpu, "navmesh": choice.navmesh}
+    if options.workers is None and (len(options.scene) == 1 or choice.name not in ONE_PER_PROCESS):
+        return VecMonitor(AVPVecEnv(options.scene, **common))
+    return VecMonitor(AVPSubprocVecEnv(options.scene, workers=options.workers, **common))
 
 
 def _model(options: argparse.Namespace, preset: Preset, env: Any) -> Any:
@@ -99,14 +123,15 @@ def _resumed_file(resume: str, folder: str) -> Path:
     return Path(found)
 
 
-def _callbacks(options: argparse.Namespace, tracking: Any) -> list[Any]:
+def _callbacks(options: argparse.Namespace, choice: SimulatorChoice, tracking: Any) -> list[Any]:
     from avp_sb3 import EvaluationCallback, MetricsCallback, RerunCallback
 
     callbacks: list[Any] = []
     # First, so that scenes that cannot be opened leave no empty run behind.
     if options.eval_scene is not None:
         best = options.out.with_stem(f"{options.out.stem}-best")
-        callbacks.append(EvaluationCallback(options.eval_scene, every=options.eval_every, best_model=best))
+        where = {"simulator": choice.name, "gpu": choice.gpu}
+        callbacks.append(EvaluationCallback(options.eval_scene, every=options.eval_every, best_model=best, **where))
     callbacks += [MetricsCallback(), tracking]
     if options.recording is not None:
         callbacks.append(RerunCallback(options.recording))
@@ -117,26 +142,19 @@ def main(argv: Sequence[str]) -> None:
     """Train, track and save."""
     options = _parser().parse_args(argv)
     preset = _preset(options)
-    settings = TaskSettings(
-        reward=options.reward,
-        observation=options.observation,
-        lookup=not options.rays,
-        width=options.width,
-        height=options.height,
-    )
+    choice = simulator_choice(options)
 
     # Late, so that --help and a mistyped option answer at once.
     import torch
-    from stable_baselines3.common.vec_env import VecMonitor
 
-    from avp_sb3 import AVPVecEnv, MLflowCallback
+    from avp_sb3 import MLflowCallback
 
     # The policy is a small network: more threads of torch only wait for each other.
     torch.set_num_threads(1)
-    env = VecMonitor(AVPVecEnv(options.scene, agents=preset.n_envs, settings=settings, seed=options.seed))
+    env = _environment(options, preset, choice)
     model = _model(options, preset, env)
     tracking = MLflowCallback(options.experiment, run_name=options.run_name)
-    callbacks = _callbacks(options, tracking)
+    callbacks = _callbacks(options, choice, tracking)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     begun = model.num_timesteps
     done = False
@@ -154,6 +172,7 @@ def main(argv: Sequence[str]) -> None:
             if not done:
                 again = shlex.join(["python", "examples/train.py", *argv, "--resume", str(options.out)])
                 print(f"to go on:  {again}")
+        env.close()
 
 
 if __name__ == "__main__":

@@ -59,6 +59,8 @@ def test_the_training_script_trains_tracks_and_saves(tmp_path):
         (("--resume", "no.zip"), "--resume no.zip: no such model file"),
         (("--resume", "runs:/1/model.zip"), "--resume runs:/1/model.zip: no MLflow database at sqlite:///"),
         (("--eval-every", 0), "--eval-every: expected at least 1, got 0"),
+        (("--gpu", 0), "--gpu: is of the simulator 'habitat', but 'raycast' was chosen"),
+        (("--workers", 0), "workers: expected 1 or a multiple of it, as there is 1 scene, got 0"),
     ],
 )
 def test_wrong_options_of_the_training_end_before_anything_is_loaded(tmp_path, words, error):
@@ -78,6 +80,18 @@ def test_a_scene_that_cannot_be_evaluated_ends_before_a_run_or_a_model_is_made(t
     assert "Traceback" not in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["model.zip"]
     assert (tmp_path / "model.zip").read_text() == "an earlier one"
+
+
+@pytest.mark.slow
+def test_the_training_script_trains_with_a_process_for_each_scene(tmp_path):
+    words = ("--steps", 2048, "--agents", 16, "--scene", "builtin:0", "builtin:1", "--workers", 2, "--out", "m.zip")
+    done = run("train.py", *words, "--width", 16, "--height", 12, "--eval-scene", "builtin:2", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "m.zip: the policy after 2048 steps" in done.stdout
+    client = MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    (found,) = client.search_runs(["1"])
+    assert found.data.tags["avp.scene"] == "builtin:0, builtin:1"
+    assert found.info.status == "FINISHED"
 
 
 @pytest.mark.slow
