@@ -459,8 +459,12 @@ def test_what_ends_habitat_sim_is_an_error_of_the_real_simulator(code, expected)
 
 
 @pytest.mark.habitat
-def test_torch_dynamo_can_be_imported_after_a_simulator():
+@pytest.mark.parametrize("before", ["", "import magnum, habitat_sim\n"])
+def test_torch_dynamo_can_be_imported_after_a_simulator(before):
     pytest.importorskip("torch")
-    done = simulated("sim = HabitatSimulator('builtin:0')\nimport torch._dynamo\nlook(sim)")
+    done = simulated(
+        before + "HabitatSimulator('builtin:0').close()\n"
+        "sim = HabitatSimulator('builtin:0')\nimport torch._dynamo\nlook(sim)"
+    )
     assert done.returncode == 0, done.stderr
     assert "(1, 12, 16)" in done.stdout

@@ -26,6 +26,8 @@ class _State:
     """Scene of the open simulator."""
     thread: int | None = None
     """Thread in which it was opened: the graphics context belongs to that one."""
+    triton_is_safe: bool = False
+    """Whether triton was loaded here, in the way that does not collide."""
 
 
 def claim(scene: str) -> None:
@@ -103,6 +105,8 @@ def import_before_graphics() -> None:
     Raises:
         SimulatorError: triton was loaded after magnum already, so that a simulator would end the process.
     """
+    if _State.triton_is_safe:
+        return
     if _TRITON in sys.modules:
         names = list(sys.modules)
         if "corrade" in names and names.index("corrade") < names.index(_TRITON):
@@ -120,6 +124,7 @@ def _import_triton() -> None:
     sys.setdlopenflags(flags & ~os.RTLD_GLOBAL)
     try:
         importlib.import_module(_TRITON)
+        _State.triton_is_safe = True
     except ImportError:
         # A triton that cannot be loaded cannot collide with anything.
         return
