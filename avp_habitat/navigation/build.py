@@ -97,7 +97,7 @@ def _with_floor(
     voxel_floor = np.where(flat.inside, low[1] + flat.floor * settings.voxel_height_m, np.nan)
     above = continued(voxel_floor, _REACH_CELLS, np.fmax)[::stride, ::stride][mask]
     top = np.nan_to_num(above, nan=float(np.nanmax(voxel_floor)))
-    return _over_cells(rings, origin, mask, top, surface_below, settings)
+    return _over_cells(rings, origin, mask, top, surface_below, settings, deepest_voxels=2 * settings.climb_voxels + 1)
 
 
 def area_in_outline(
@@ -132,7 +132,9 @@ def area_in_outline(
     floor = _height_on(triangles, shapes, centres[mask])
     # On half voxels, so that a slope is asked about on few heights.
     step = settings.voxel_height_m / 2
-    return _over_cells(rings, low, mask, np.ceil(floor / step - 1e-6) * step, surface_below, settings)
+    top = np.ceil(floor / step - 1e-6) * step
+    # A navigation mesh follows the floor's outline; across a slope its few corners leave it well above the floor.
+    return _over_cells(rings, low, mask, top, surface_below, settings, deepest_voxels=settings.height_voxels)
 
 
 def _height_on(triangles: Float, shapes: NDArray, points: Float) -> Float:
@@ -156,8 +158,13 @@ def _over_cells(
     floor: Float,
     surface_below: SurfaceBelow,
     settings: NavigationSettings,
+    *,
+    deepest_voxels: int,
 ) -> NavigableArea:
-    """The area whose navigable cells have these `(m,)` floor heights, each made true by a ray from a step above."""
+    """The area whose navigable cells have these `(m,)` floor heights, each made true by a ray from a step above.
+
+    What is seen farther below than `deepest_voxels` is not this floor.
+    """
     cell = max(1, round(settings.cell_m / settings.voxel_m)) * settings.voxel_m
     if not mask.any():
         raise SceneError(f"the navigable area is smaller than one cell of {cell:g} m; is the scene not in metres?")
@@ -165,7 +172,7 @@ def _over_cells(
     x, z = origin[0] + (columns + 0.5) * cell, origin[1] + (rows + 0.5) * cell
     top = floor + settings.climb_voxels * settings.voxel_height_m
     found = np.asarray(surface_below(np.stack([x, top, z], axis=1)), dtype=np.float64)
-    deepest = (2 * settings.climb_voxels + 1) * settings.voxel_height_m + SKIN_M
+    deepest = deepest_voxels * settings.voxel_height_m + SKIN_M
     heights = np.full(mask.shape, np.nan)
     heights[mask] = np.where((top - found >= 0) & (top - found <= deepest), found, np.nan)
     if not np.isfinite(heights).any():

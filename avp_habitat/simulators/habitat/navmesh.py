@@ -37,7 +37,10 @@ def navmesh_area(engine: HabitatEngine, navmesh: Path | None) -> NavigableArea:
 
 def _given(engine: HabitatEngine, path: Path, own: NavigableArea, settings: NavigationSettings) -> NavigableArea:
     agent = engine.load_navmesh(path)
-    area = _area(engine, settings)
+    try:
+        area = _area(engine, settings)
+    except SceneError as error:
+        raise SceneError(f"{path}: is this the NavMesh of another scene? The open one has no floor below it") from error
     # A NavMesh for a wider agent lies within ours, one for a narrower agent around it.
     inside, around = own.contains(area.centres).mean(), area.contains(own.centres).mean()
     if max(inside, around) < _BELONGS:
@@ -134,6 +137,11 @@ def _below_in_tile(engine: HabitatEngine, points: Float, corner: Float) -> NDArr
     above = np.array([[middle[0], top + _TILE.distance_m, middle[1]]])
     # Looking straight down with yaw 0, columns run along +X and rows along +Z.
     below = engine.render_overhead(camera_to_world(above, yaw=np.zeros(1), pitch=np.full(1, -np.pi / 2))[0], _TILE)
-    at = np.floor((points[:, [2, 0]] - corner[::-1]) / _TILE.side_m * _TILE.pixels).astype(np.int64)
-    row, column = np.clip(at, 0, _TILE.pixels - 1).T
-    return top - below[row, column]
+    offset, depth = points[:, [2, 0]] - middle[::-1], np.zeros(len(points))
+    for _ in range(2):
+        # Rays spread a little below the cut plane: on a slope, the right one is known once the depth is.
+        share = _TILE.distance_m / (_TILE.distance_m + np.nan_to_num(depth))
+        at = np.floor((offset * share[:, None] / _TILE.side_m + 0.5) * _TILE.pixels).astype(np.int64)
+        row, column = np.clip(at, 0, _TILE.pixels - 1).T
+        depth = below[row, column]
+    return top - depth
