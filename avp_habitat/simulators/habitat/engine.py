@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from avp_habitat.simulators.base import Frames
 from avp_habitat.simulators.habitat.installed import cannot_load
 
 _NO_IMAGE = "no-image-based-lighting"
+_NO_NAVMESH = ("Could not build Detour navmesh", "Failed to build navmesh")
 _CLONE_FS = 0x200
 
 
@@ -68,16 +69,22 @@ class HabitatEngine:
         self._sensors: dict[tuple[Intrinsics | OverheadCamera, bool], Any] = {}
         configuration = self._configuration(dataset, scene_id, gpu)
         try:
-            if gpu < 0:
-                with _quiet_stderr(_NO_IMAGE):
-                    configuration.metadata_mediator = _unlit_mediator(self._habitat, configuration.sim_cfg)
-                    self._sim = self._habitat.Simulator(configuration)
-            else:
+            with _quiet_stderr(_NO_IMAGE) if gpu < 0 else nullcontext():
+                configuration.metadata_mediator = _mediator(self._habitat, configuration.sim_cfg, lit=gpu >= 0)
                 self._sim = self._habitat.Simulator(configuration)
         except Exception as error:
             # Its failed checks arrive as AssertionError, damaged files as RuntimeError, and so on.
             raise SceneError(f"{scene_id}: Habitat-Sim cannot read it: {_last_line(error)}") from error
+        self.objects = self._fixed_objects()
         self._node: Any = self._sim.get_agent(0).scene_node
+
+    def _fixed_objects(self) -> int:
+        """Make the scene's objects obstacles, because the NavMesh leaves out those alone that can never move."""
+        manager = self._sim.get_rigid_object_manager()
+        handles = manager.get_object_handles()
+        for handle in handles:
+            manager.get_object_by_handle(handle).motion_type = self._habitat.physics.MotionType.STATIC
+        return len(handles)
 
     def _configuration(self, dataset: Path, scene_id: str, gpu: int) -> Any:
         habitat = self._habitat
@@ -142,7 +149,8 @@ class HabitatEngine:
             arguments = (True,)
         finder = self._sim.pathfinder
         try:
-            done = self._sim.recompute_navmesh(finder, made, *arguments)
+            with _quiet_stderr(*_NO_NAVMESH):
+                done = self._sim.recompute_navmesh(finder, made, *arguments)
         except Exception as error:
             raise SceneError(f"Habitat-Sim cannot make its NavMesh: {_last_line(error)}") from error
         # Asking a PathFinder without a NavMesh anything ends the process (SIGSEGV).
@@ -231,6 +239,18 @@ def scene_names(dataset: Path) -> list[str]:
     return sorted(habitat.metadata.MetadataMediator(backend).get_scene_handles())
 
 
+def _mediator(habitat: Any, backend: Any, *, lit: bool) -> Any:
+    """Habitat-Sim's reader of datasets, told to show objects as it shows stages: flat, since there are no lights."""
+    made = None if lit else _unlit_mediator(habitat, backend)
+    mediator = made or habitat.metadata.MetadataMediator(backend)
+    objects = mediator.object_template_manager
+    for handle in objects.get_file_template_handles():
+        template = objects.get_template_by_handle(handle)
+        template.force_flat_shading = True
+        objects.register_template(template, handle)
+    return mediator
+
+
 def _unlit_mediator(habitat: Any, backend: Any) -> Any:
     """Habitat-Sim's reader of datasets, told not to prepare image-based lighting, which flat shading never uses.
 
@@ -256,8 +276,8 @@ def _unlit_mediator(habitat: Any, backend: Any) -> Any:
 
 
 @contextmanager
-def _quiet_stderr(word: str) -> Iterator[None]:
-    """Hold back what is written to stderr, by C++ too, and hand it on in the end without the lines that hold `word`."""
+def _quiet_stderr(*words: str) -> Iterator[None]:
+    """Hold back what is written to stderr, by C++ too; in the end hand on the lines that hold none of `words`."""
     sys.stderr.flush()
     kept = os.dup(2)
     with tempfile.TemporaryFile() as file:
@@ -269,14 +289,14 @@ def _quiet_stderr(word: str) -> Iterator[None]:
             os.dup2(kept, 2)
             os.close(kept)
             file.seek(0)
-            lines = [line for line in file if word.encode() not in line]
+            lines = [line for line in file if not any(word.encode() in line for word in words)]
             os.write(2, b"".join(lines)) if lines else None
 
 
 def _centred(camera: Intrinsics) -> tuple[Intrinsics, slice, slice]:
     """A camera as Habitat-Sim can have it (principal point in the middle), and the rows and columns to take of it."""
     width, height = (
-        2 * math.ceil(max(centre, size - centre))
+        math.ceil(2 * max(centre, size - centre))
         for centre, size in ((camera.cx, camera.width), (camera.cy, camera.height))
     )
     column, row = width / 2 - camera.cx, height / 2 - camera.cy

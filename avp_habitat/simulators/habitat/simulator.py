@@ -59,6 +59,7 @@ class HabitatSimulator:
         try:
             from avp_habitat.simulators.habitat.navmesh import navmesh_area
 
+            _check_objects(location, self._engine.objects)
             self._area = navmesh_area(self._engine, path)
         except BaseException as error:
             self.close()
@@ -113,6 +114,14 @@ def _close(engine: "HabitatEngine") -> None:
     # A forked child inherits the object, but must leave alone what its parent still uses.
     if process.release():
         engine.close()
+
+
+def _check_objects(location: SceneLocation, shown: int) -> None:
+    if shown < location.objects:
+        raise SceneError(
+            f"has {location.objects} objects, but Habitat-Sim shows {shown} of them without its physics (Bullet), "
+            "which articulated objects need; use a scene without those, or its stage alone"
+        )
 
 
 def _navmesh_file(navmesh: str | Path | None) -> Path | None:
