@@ -5,6 +5,10 @@ The three rewards share these values; choose one by `--env-kwargs reward:"'cover
 n_steps:512`. To train in several rooms:
 `-params vec_env_wrapper:"{'avp_sb3.zoo.Batched': {'scenes': ['builtin:1', 'builtin:2']}}"`.
 
+On Habitat-Sim: `--env-kwargs simulator:"'habitat'"`. It allows one scene per process: for several add
+`--vec-env subproc` with as many environments, for example `-params n_envs:2 n_steps:1024`; each is in a
+process of its own.
+
 Every training is a run of MLflow and leaves some of its episodes as `runs/avp-DATE-TIME.rrd` for Rerun. To have the
 policy evaluated on other scenes too, and the best model kept, name all callbacks again:
 `-params callback:"['avp_sb3.MLflowCallback', 'avp_sb3.MetricsCallback', 'avp_sb3.RerunCallback',

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from avp_habitat.env import AVPEnv
 from avp_habitat.errors import UsageError
 from avp_habitat.settings import TaskSettings
-from avp_habitat.simulators import Simulator, make_simulator
+from avp_habitat.simulators import ONE_PER_PROCESS, Simulator, SimulatorChoice, open_simulator
 from avp_sb3.vec_env import AVPVecEnv
 from avp_sb3.zoo_processes import WatchedProcesses
 
@@ -110,7 +110,13 @@ def _simulators(envs: list[AVPEnv], scenes: Sequence[str]) -> list[Simulator]:
             f"{_HOOK}: expected at least one environment for each of the {len(scenes)} scenes, got {len(envs)}; "
             f"set n_envs:{len(scenes)} and n_steps so that their product is PPO's buffer"
         )
-    return [make_simulator(own[0].name, scene) for scene in scenes]
+    choice = envs[0].choice or SimulatorChoice(own[0].name)
+    if choice.name in ONE_PER_PROCESS and len(scenes) > 1:
+        raise UsageError(
+            f"{_HOOK}: scenes: a process can hold one simulator of {choice.name!r}, got {len(scenes)} scenes; add "
+            f"--vec-env subproc and set n_envs:{len(scenes)}, with n_steps so that their product is PPO's buffer"
+        )
+    return [open_simulator(choice, scene) for scene in scenes]
 
 
 def _shortest_cycle(simulators: list[Simulator]) -> list[Simulator]:

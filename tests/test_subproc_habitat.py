@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from avp_habitat.env import AVPEnv
-from avp_habitat.errors import SimulatorError
+from avp_habitat.errors import SimulatorError, UsageError
 from avp_habitat.settings import TaskSettings
 from avp_sb3 import AVPSubprocVecEnv, EvaluationCallback, zoo
 
@@ -60,6 +60,8 @@ def test_an_evaluation_opens_other_scenes_beside_the_trainings(tmp_path):
     model.learn(16, callback=evaluation)
     assert evaluation.best is not None
     assert (tmp_path / "best.zip").exists()
+    with pytest.raises(UsageError, match=r"Batched: scenes: .*got 2 scenes; add --vec-env subproc and set n_envs:2"):
+        zoo.Batched(DummyVecEnv([lambda: AVPEnv("builtin:0", simulator="habitat", **SMALL)] * 2), scenes=ROOMS)
     version = env.simulator.version
     assert version.startswith("habitat-sim 0.")
     env.change_scene("builtin:1")
