@@ -83,7 +83,7 @@ def main(argv: Sequence[str]) -> None:
                 pass
             results["recording"] = [bench.recording()]
             results["delay"] = [bench.delay()]
-    _write_page(options.out)
+    reporting.write_page(options.out, "What the callbacks cost", __doc__)
 
 
 @contextmanager
@@ -284,36 +284,6 @@ def _cost(way: str, timings: Sequence[Timing], bare: Sequence[Timing]) -> dict[s
         "all": clock,
         "all_of_cpu": cpu,
     }
-
-
-def _write_page(report: Path) -> None:
-    """The JSON report as a page beside it."""
-    told = json.loads(report.read_text())
-    machine = told["machine"]
-    facts = {
-        "Command": f"`{told['command']}`",
-        "Time": told["time"],
-        "Seed": told["options"]["seed"],
-        "Commit": told["git_commit"],
-        "Machine": f"{machine['cpus']} cores, {machine['cpu_model']}, {machine['system']}, load "
-        f"{machine['load_average']:.1f}",
-        "Versions": ", ".join(f"{name} {version}" for name, version in told["versions"].items()),
-    }
-    lines = ["# What the callbacks cost", "", *(__doc__ or "").partition("\n\n")[2].strip().splitlines(), ""]
-    lines += [f"- {name}: {value}" for name, value in facts.items()]
-    for title, rows in told["results"].items():
-        lines += ["", f"## {title.capitalize()}", "", *_markdown(rows)]
-    page = report.with_suffix(".md")
-    temporary = page.with_name(page.name + ".part")
-    temporary.write_text("\n".join(lines) + "\n")
-    os.replace(temporary, page)
-    print(f"{page}: the same as a page")
-
-
-def _markdown(rows: Sequence[reporting.Row]) -> list[str]:
-    keys = list(rows[0])
-    lines = [keys, ["---"] * len(keys), *([reporting._text(row[key]) for key in keys] for row in rows)]
-    return [f"| {' | '.join(cells)} |" for cells in lines]
 
 
 if __name__ == "__main__":

@@ -131,6 +131,46 @@ def write_report(path: Path, name: str, options: argparse.Namespace, *, complete
     print(f"\n{path}: {'the whole report' if complete else 'what was measured before the interruption'}")
 
 
+def write_page(report: Path, title: str, description: str | None, picture: str | None = None) -> None:
+    """Write a JSON report as a Markdown page beside it.
+
+    Args:
+        report: as `write_report` left it.
+        title: of the page.
+        description: the script's docstring; all but its first paragraph stands above the tables.
+        picture: what a picture beside the report (`.jpg`) shows, if there is one.
+    """
+    told = json.loads(report.read_text())
+    here = told["machine"]
+    facts = {
+        "Command": f"`{told['command']}`",
+        "Time": told["time"],
+        "Seed": told["options"]["seed"],
+        "Commit": told["git_commit"],
+        "Machine": f"{here['cpus']} cores, {here['cpu_model']}, {here['system']}, load {here['load_average']:.1f}",
+        "Versions": ", ".join(f"{name} {version}" for name, version in told["versions"].items()),
+    }
+    lines = [f"# {title}", "", *(description or "").partition("\n\n")[2].strip().splitlines(), ""]
+    lines += [f"- {name}: {value}" for name, value in facts.items()]
+    if picture is not None:
+        lines += ["", f"![{picture}]({report.with_suffix('.jpg').name})"]
+    for name, rows in told["results"].items():
+        if rows:
+            lines += ["", f"## {name.capitalize()}", "", *markdown(rows)]
+    page = report.with_suffix(".md")
+    temporary = page.with_name(page.name + ".part")
+    temporary.write_text("\n".join(lines) + "\n")
+    os.replace(temporary, page)
+    print(f"{page}: the same as a page")
+
+
+def markdown(rows: Sequence[Row]) -> list[str]:
+    """Lines of a Markdown table of rows under their keys."""
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    lines = [keys, ["---"] * len(keys), *([_text(row.get(key)) for key in keys] for row in rows)]
+    return [f"| {' | '.join(cells)} |" for cells in lines]
+
+
 def machine() -> dict[str, Any]:
     """Processors that this process may use, their model, the memory in bytes and the load average of a minute."""
     return {

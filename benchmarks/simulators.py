@@ -15,26 +15,33 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import reporting
 from numpy.typing import NDArray
+from PIL import Image
 from tqdm import tqdm
 
 from avp_habitat import command, poses
 from avp_habitat.baselines.frontier import FrontierPolicy
 from avp_habitat.env import AVPEnv
+from avp_habitat.intervals import mean_and_half_width
 from avp_habitat.observation import NAMES
+from avp_habitat.policies import check_policy
 from avp_habitat.poses import Intrinsics
 from avp_habitat.settings import ACTION_NAMES, MOVE_FORWARD, TaskSettings
 from avp_habitat.simulators import Simulator, make_simulator
+from avp_habitat.simulators.habitat.graphics import FIRST_DEVICE, choose_gpu, inspect_graphics
+from avp_sb3.evaluation import evaluate_policy
 
 CAMERA = Intrinsics.from_hfov(640, 480, hfov_deg=90.0)
 SENSOR_HEIGHT_M = 1.5
 BEND_M = 0.02
 """Depth that differs by more than this from what a plane through the neighbours would have is an edge."""
 _CHUNK = 5
+_PICTURE = "Per scene: raycast, habitat, and four times their difference"
 
 
 @dataclass(frozen=True)
@@ -200,6 +207,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--poses", default=50, type=int, help="pictures from so many poses")
     add("--actions", default=200, type=int, help="length of the walk")
     add("--walks", default=5, type=int, help="walks, each from a start of its own")
+    add("--policy", default=[], nargs="*", help="baselines' names or PPO models (.zip) to evaluate in both")
+    add("--episodes", default=20, type=int, help="per policy, scene and simulator, from the same starts")
     add("--seed", default=0, type=int, help="of poses, starts and actions")
     add("--gpu", default=None, type=int, help="CUDA device of habitat; -1 for none; the first one when left out")
     return made
@@ -208,16 +217,61 @@ def _parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str]) -> None:
     """Compare, print and write."""
     options = _parser().parse_args(argv)
-    reporting.check_least(options, poses=1, actions=1, walks=1, seed=0)
+    reporting.check_least(options, poses=1, actions=1, walks=1, episodes=1, seed=0)
+    for policy in options.policy:
+        check_policy(policy)
+    rows = []
     with reporting.reported("simulators", options) as results:
-        for name in ("pictures", "areas", "walks", "speed"):
+        for name in ("simulators", "pictures", "areas", "walks", "policies", "speed"):
             results[name] = []
         for scene in tqdm(options.scene, desc="scenes", disable=None):
             raycast = make_simulator("raycast", scene)
             habitat = make_simulator("habitat", scene, gpu=options.gpu)
+            if not results["simulators"]:
+                results["simulators"] = [_about(each, options.gpu) for each in (raycast, habitat)]
             _one_scene(raycast, habitat, options, results)
+            _policies(scene, raycast.scene, options, results)
+            rows.append(_side_by_side(raycast, habitat, options.seed))
             habitat.close()
             del habitat
+    options.out.with_suffix(".jpg").unlink(missing_ok=True)
+    Image.fromarray(np.concatenate(rows)).save(options.out.with_suffix(".jpg"), quality=88)
+    reporting.write_page(options.out, "The two simulators side by side", __doc__, _PICTURE)
+
+
+def _about(simulator: Simulator, gpu: int | None) -> dict[str, Any]:
+    renderer = "Embree, on the CPU"
+    if simulator.name == "habitat":
+        device = choose_gpu(gpu)
+        context = inspect_graphics(FIRST_DEVICE).context if device < 0 else None
+        renderer = f"OpenGL {context.version}, {context.renderer}" if context else f"CUDA device {device}"
+    return {"simulator": simulator.name, "version": simulator.version, "renderer": renderer}
+
+
+def _policies(scene: str, name: str, options: argparse.Namespace, results: reporting.Results) -> None:
+    for policy in options.policy:
+        for simulator in ("raycast", "habitat"):
+            gpu = options.gpu if simulator == "habitat" else None
+            done = evaluate_policy(
+                policy, scene, episodes=options.episodes, simulator=simulator, gpu=gpu, stochastic=True
+            )
+            row: dict[str, Any] = {"scene": name, "policy": Path(policy).name, "simulator": simulator}
+            for figure, factor in (("coverage", 100), ("views", 1), ("stopped", 100), ("path_length_m", 1)):
+                mean, half = mean_and_half_width(factor * done.figures[figure])
+                row |= {figure: float(mean), f"{figure}_±": float(half)}
+            results["policies"].append(row | {"episodes": options.episodes})
+
+
+def _side_by_side(raycast: Simulator, habitat: Simulator, seed: int) -> NDArray[np.uint8]:
+    """`(h, w, 3)` what both see from the pose that sees farthest of some, and four times the difference."""
+    candidates = scattered_poses(raycast, 20, seed)
+    depth = raycast.render(candidates, Intrinsics.from_hfov(32, 24, hfov_deg=90.0), rgb=False).depth
+    pose = candidates[depth.mean(axis=(1, 2)).argmax()][None]
+    one, other = (simulator.render(pose, CAMERA, rgb=True).rgb for simulator in (raycast, habitat))
+    assert one is not None
+    assert other is not None
+    apart = np.minimum(4 * np.abs(one[0].astype(np.int16) - other[0]), 255).astype(np.uint8)
+    return np.concatenate([one[0], other[0], apart], axis=1)[::2, ::2]
 
 
 def _one_scene(raycast: Simulator, habitat: Simulator, options: argparse.Namespace, results: reporting.Results) -> None:

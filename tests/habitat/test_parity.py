@@ -118,7 +118,7 @@ def _actions(measure, simulator, kind, start, seed):
 
 def test_visible_cells_are_those_that_rays_reach(both, measure):
     raycast, habitat = both
-    poses = measure.scattered_poses(raycast, 5, seed=3)
+    poses = measure.scattered_poses(raycast, 20, seed=3)
     settings = TaskSettings()
     points = habitat.area.centres
     everything = np.ones((len(poses), len(points)), bool)

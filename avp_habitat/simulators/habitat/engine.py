@@ -2,7 +2,7 @@
 
 What differs between them: sensors belong to the simulator from 0.3.4 on (`Simulator.sensors`) and to its agents before;
 `recompute_navmesh` takes the static objects as an argument before 0.2.5 and as a setting since; vectors are
-`magnum.Vector3` from 0.3.3 on. The tag v0.3.4 still calls itself 0.3.3.
+`magnum.Vector3` from 0.3.3 on.
 """
 
 import ctypes
@@ -25,7 +25,7 @@ from avp_habitat.errors import SceneError, SimulatorError
 from avp_habitat.navigation.settings import NavigationSettings
 from avp_habitat.poses import Intrinsics
 from avp_habitat.simulators.base import Frames
-from avp_habitat.simulators.habitat.installed import cannot_load
+from avp_habitat.simulators.habitat.installed import cannot_load, require_installed
 
 _NO_IMAGE = "no-image-based-lighting"
 _NO_NAVMESH = ("Could not build Detour navmesh", "Failed to build navmesh")
@@ -65,7 +65,7 @@ class HabitatEngine:
             SceneError: Habitat-Sim cannot read the scene; the text is its own.
         """
         self._habitat = _import_habitat()
-        self.version = f"habitat-sim {_version(self._habitat)}"
+        self.version = f"habitat-sim {require_installed().version}"
         self._sensors: dict[tuple[Intrinsics | OverheadCamera, bool], Any] = {}
         configuration = self._configuration(dataset, scene_id, gpu)
         try:
@@ -231,14 +231,6 @@ class HabitatEngine:
         self._node.transformation = Matrix4(*(Vector4(*column) for column in pose.T.tolist()))
 
 
-def scene_names(dataset: Path) -> list[str]:
-    """Names of the scenes that Habitat-Sim finds in a `.scene_dataset_config.json`."""
-    habitat = _import_habitat()
-    backend = habitat.SimulatorConfiguration()
-    backend.scene_dataset_config_file = str(dataset)
-    return sorted(habitat.metadata.MetadataMediator(backend).get_scene_handles())
-
-
 def _mediator(habitat: Any, backend: Any, *, lit: bool) -> Any:
     """Habitat-Sim's reader of datasets, told to show objects as it shows stages: flat, since there are no lights."""
     made = None if lit else _unlit_mediator(habitat, backend)
@@ -306,11 +298,6 @@ def _centred(camera: Intrinsics) -> tuple[Intrinsics, slice, slice]:
     return whole, slice(int(row), int(row) + camera.height), slice(int(column), int(column) + camera.width)
 
 
-def _version(habitat: Any) -> str:
-    named = str(habitat.__version__)
-    return "0.3.4" if named == "0.3.3" and hasattr(habitat.Simulator, "sensors") else named
-
-
 def _last_line(error: Exception) -> str:
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[-1] if lines else type(error).__name__
@@ -319,9 +306,13 @@ def _last_line(error: Exception) -> str:
 def _import_habitat() -> Any:
     os.environ.setdefault("MAGNUM_LOG", "quiet")
     os.environ.setdefault("HABITAT_SIM_LOG", "quiet")
+    flags = sys.getdlopenflags()
     try:
         import magnum  # noqa: F401 # pyright: ignore[reportMissingImports] - has to come before habitat_sim
         import habitat_sim  # isort: skip # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise SimulatorError(cannot_load(error)) from error
+    finally:
+        # corrade leaves RTLD_GLOBAL on, with which the symbols of all that is imported later meet Mesa's.
+        sys.setdlopenflags(flags)
     return habitat_sim
