@@ -12,14 +12,12 @@ of its own. The delay is the time from a point's logging until another process f
 import argparse
 import gc
 import json
-import os
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -35,7 +33,6 @@ from avp_sb3.presets import TABLE_4
 _BUFFER = TABLE_4.n_envs * TABLE_4.n_steps
 _NONE, _ALL = "none", "all"
 _ALONE = ("metrics", "MLflow", "Rerun", "evaluation")
-_VARIABLES = ("AVP_CACHE", "AVP_MLFLOW_SPOOL")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -75,7 +72,7 @@ def main(argv: Sequence[str]) -> None:
     check_reward(options.reward)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        with _own_folders(folder), reporting.reported("callbacks", options) as results:
+        with reporting.own_folders(folder), reporting.reported("callbacks", options) as results:
             bench = _Bench(options, folder)
             results["evaluation"] = [bench.first_evaluation()]
             bench.train(_ALL, options.seed + options.repeats, steps=_BUFFER)
@@ -84,20 +81,6 @@ def main(argv: Sequence[str]) -> None:
             results["recording"] = [bench.recording()]
             results["delay"] = [bench.delay()]
     reporting.write_page(options.out, "What the callbacks cost", __doc__)
-
-
-@contextmanager
-def _own_folders(folder: Path) -> Iterator[None]:
-    """Tables and MLflow's spool are kept in this folder, not among the user's."""
-    before = {name: os.environ.get(name) for name in _VARIABLES}
-    os.environ.update({name: str(folder / name) for name in _VARIABLES})
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            del os.environ[name]
-            if value is not None:
-                os.environ[name] = value
 
 
 class _Bench:

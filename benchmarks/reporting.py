@@ -19,6 +19,7 @@ from avp_habitat.versions import installed_versions
 FORMAT_VERSION = 1
 """Of the JSON files; rises when a key changes its meaning."""
 _PACKAGES = ("avp-suite", "open3d", "numba", "numpy", "stable-baselines3", "torch", "mlflow", "rerun-sdk")
+_VARIABLES = ("AVP_CACHE", "AVP_MLFLOW_SPOOL")
 
 Row = Mapping[str, Any]
 Results = dict[str, list[dict[str, Any]]]
@@ -94,6 +95,20 @@ def reported(name: str, options: argparse.Namespace) -> Iterator[Results]:
             for title, rows in results.items():
                 print_table(title, rows)
             write_report(options.out, name, options, complete=complete, results=results)
+
+
+@contextmanager
+def own_folders(folder: Path) -> Iterator[None]:
+    """Tables and MLflow's spool are kept in this folder, not among the user's, also by processes started meanwhile."""
+    before = {name: os.environ.get(name) for name in _VARIABLES}
+    os.environ.update({name: str(folder / name) for name in _VARIABLES})
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            del os.environ[name]
+            if value is not None:
+                os.environ[name] = value
 
 
 def write_report(path: Path, name: str, options: argparse.Namespace, *, complete: bool, results: Results) -> None:

@@ -16,7 +16,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -63,23 +62,10 @@ def main(argv: Sequence[str]) -> None:
     check_reward(options.reward)
     with tempfile.TemporaryDirectory() as name, reporting.reported("training", options) as results:
         folder = Path(name)
-        with _cache(folder / "tables"):
+        with reporting.own_folders(folder):
             for _ in tqdm(_trainings(options, folder, results), total=_WAYS * options.repeats, desc="trainings"):
                 pass
             _processes(options, folder, results)
-
-
-@contextmanager
-def _cache(folder: Path) -> Iterator[None]:
-    """Tables are kept in this folder by this process and those that it starts."""
-    before = os.environ.get(CACHE)
-    os.environ[CACHE] = str(folder)
-    try:
-        yield
-    finally:
-        del os.environ[CACHE]
-        if before is not None:
-            os.environ[CACHE] = before
 
 
 def _trainings(options: argparse.Namespace, folder: Path, results: reporting.Results) -> Iterator[None]:
@@ -188,7 +174,7 @@ def _processes(options: argparse.Namespace, folder: Path, results: reporting.Res
     cases = [(agents, True) for agents in options.memory_agents]
     cases[:0] = [(agents, False) for agents in options.memory_agents[:1]]
     for agents, kept in tqdm(cases, desc="processes"):
-        cache = folder / "tables" if kept else folder / "no tables"
+        cache = folder / CACHE if kept else folder / "no tables"
         row = _process(options, agents, cache)
         results["processes"].append({"tables_on_disk": kept} | row)
 
