@@ -22,6 +22,7 @@ from avp_habitat.poses import Intrinsics
 from avp_habitat.rewards import REWARD_NAMES
 from avp_habitat.rollout_capture import capture_heldout, capture_step, publish_rollout
 from avp_habitat.rollout_writer import RolloutWriter
+from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.settings import TaskSettings
 from avp_habitat.simulators import SimulatorChoice, open_simulator
 from avp_habitat.simulators.options import add_simulator_options, simulator_choice
@@ -36,7 +37,7 @@ class Request:
     """What to collect."""
 
     scene: str
-    """A mesh file, or `builtin:SEED`."""
+    """As `avp_habitat.scenes.location.locate` takes it."""
     policy: str
     """A baseline's name, or a PPO model (`.zip`)."""
     out: Path
@@ -104,7 +105,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Let a policy capture one episode of a scene: pictures, depth, poses, coverage, held-out views.",
     )
     add = parser.add_argument
-    add("--scene", required=True, help="a mesh (.glb .gltf .ply .obj), or builtin:SEED for a generated room")
+    add("--scene", required=True, help=SCENES)
     add("--policy", required=True, metavar="POLICY", help=f"{', '.join(POLICY_NAMES)}, or a PPO model (.zip)")
     add("--out", required=True, type=Path, help="the rollout folder to write; must not exist")
     add("--reward", default="proposed", metavar="REWARD", help=f"{', '.join(REWARD_NAMES)} (default: %(default)s)")

@@ -47,7 +47,7 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         """Open a scene.
 
         Args:
-            scene: a mesh file (`.glb .gltf .ply .obj`), or `builtin:SEED`.
+            scene: as `avp_habitat.scenes.location.locate` takes it.
             simulator: `raycast`, `habitat`, or one that is open already (the scene's name is then its own).
             gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
             navmesh: file of the scene's NavMesh for `habitat`; computed when omitted.

@@ -16,6 +16,7 @@ from avp_habitat.drawing import draw_trajectory
 from avp_habitat.errors import UsageError
 from avp_habitat.policies import POLICY_NAMES
 from avp_habitat.rewards import REWARD_NAMES
+from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.settings import OBSERVATION_NAMES, TaskSettings
 from avp_habitat.simulators.options import add_simulator_options, simulator_choice
 from avp_habitat.trajectory import Trajectory
@@ -31,7 +32,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Run policies on one scene from the same starts; compare coverage per view, views, path, stops.",
     )
     add = parser.add_argument
-    add("--scene", required=True, help="a mesh (.glb .gltf .ply .obj), or builtin:SEED for a generated room")
+    add("--scene", required=True, help=SCENES)
     add(
         "--policy",
         required=True,

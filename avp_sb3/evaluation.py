@@ -91,7 +91,7 @@ class Contestant:
 
         Args:
             policy: a baseline's name, or a model saved by Stable-Baselines3 (`.zip`).
-            scene: a mesh file, or `builtin:SEED`.
+            scene: as `avp_habitat.scenes.location.locate` takes it.
             settings: of the task; visibility is always computed, never looked up.
             simulator: the simulator's name.
             gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
@@ -159,7 +159,7 @@ def evaluate_policy(
 
     Args:
         policy: a baseline's name, or a model saved by Stable-Baselines3 (`.zip`).
-        scene: a mesh file, or `builtin:SEED`.
+        scene: as `avp_habitat.scenes.location.locate` takes it.
         episodes: n, at least 1.
         seed: of the first episode.
         settings: of the task; the design's defaults when omitted. Visibility is always computed, never looked up.

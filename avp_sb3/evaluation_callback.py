@@ -72,7 +72,7 @@ class EvaluationCallback(BaseCallback):
         """Describe the evaluation; scenes are opened when the training starts.
 
         Args:
-            scenes: mesh files or `builtin:SEED`; `builtin:7` when omitted.
+            scenes: each as `avp_habitat.scenes.location.locate` takes it; `builtin:7` when omitted.
             eval_env: instead of scenes: an environment of its own whose `info` holds `avp_episode` at the end of an
                 episode. With `coverage` in every `info` there is a curve, with attributes `scene_name`, `area` and
                 `settings` (those of `AVP-v0`) there are figures per scene, maps, and figures of the whole budget.

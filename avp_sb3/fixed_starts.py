@@ -17,7 +17,7 @@ class FixedStarts(AVPVecEnv):
         """Open the scenes.
 
         Args:
-            scenes: mesh files or `builtin:SEED`.
+            scenes: each as `avp_habitat.scenes.location.locate` takes it.
             episodes: in each scene.
             simulator: the simulator's name.
             settings: of the task.

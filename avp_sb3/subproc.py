@@ -49,7 +49,8 @@ class AVPSubprocVecEnv(VecEnv):
         """Start the workers, and wait until all scenes are open.
 
         Args:
-            scene: a mesh file, or `builtin:SEED`, or several; agent i walks in scene i modulo their number.
+            scene: as `avp_habitat.scenes.location.locate` takes it, or several; agent i walks in scene i modulo their
+                number.
             agents: n, at least one for each worker; one for each when omitted.
             workers: processes, a multiple of the number of scenes; one for each scene when omitted. Agent i is of
                 worker i modulo their number.

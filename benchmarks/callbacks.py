@@ -28,6 +28,7 @@ from tqdm import tqdm
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.rewards import check_reward
+from avp_habitat.scenes.location import HELP as SCENES
 from avp_sb3.presets import TABLE_4
 
 _BUFFER = TABLE_4.n_envs * TABLE_4.n_steps
@@ -38,7 +39,7 @@ _ALONE = ("metrics", "MLflow", "Rerun", "evaluation")
 def _parser() -> argparse.ArgumentParser:
     made = reporting.parser(__doc__, "callbacks")
     add = made.add_argument
-    add("--scene", default="builtin:0", help="a mesh (.glb .gltf .ply .obj), or builtin:SEED")
+    add("--scene", default="builtin:0", help=SCENES)
     add("--reward", default="proposed", help="the reward's name")
     add("--agents", default=TABLE_4.n_envs, type=int, help="stepped as one batch; divides PPO's buffer of 2048 steps")
     add("--repeats", default=5, type=int, help="repetitions")

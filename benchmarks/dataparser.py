@@ -30,6 +30,7 @@ from avp_habitat.collect import Request, collect
 from avp_habitat.errors import AVPError
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout import frame_name, read_rollout
+from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.settings import TaskSettings
 
 _REPEATS = 3
@@ -43,7 +44,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--width", default=640, type=int, help="of the pictures, pixels")
     add("--height", default=480, type=int, help="of the pictures, pixels")
     add("--pictures", default=40, type=int, help="different pictures among them")
-    add("--scene", default="builtin:1", help="the room: builtin:SEED, or a mesh")
+    add("--scene", default="builtin:1", help=f"the room: {SCENES}")
     return made
 
 

@@ -26,6 +26,7 @@ from avp_habitat.errors import UsageError
 from avp_habitat.lookup.disk import ENVIRONMENT as CACHE
 from avp_habitat.lookup.tables import scene_tables
 from avp_habitat.scenes.loader import load_scene
+from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.settings import ACTION_NAMES, TaskSettings
 from avp_sb3.vec_env import AVPVecEnv
 
@@ -50,7 +51,7 @@ class Case:
 def _parser() -> argparse.ArgumentParser:
     made = reporting.parser(__doc__, "environment")
     add = made.add_argument
-    add("--scene", default="builtin:0", help="a mesh (.glb .gltf .ply .obj), or builtin:SEED")
+    add("--scene", default="builtin:0", help=SCENES)
     add("--agents", default=[1, 4, 16, 64], type=int, nargs="+", help="agents stepped as one batch")
     add("--resolutions", default=["64x48", "160x120", "320x240"], nargs="+", help="depth images, WIDTHxHEIGHT")
     add("--seconds", default=3.0, type=float, help="of steps per row; casting the rays again takes up to as long")

@@ -30,6 +30,7 @@ from avp_habitat.lookup.lattice import TILE, Lattice
 from avp_habitat.lookup.tables import SceneTables, scene_tables
 from avp_habitat.scenes.export import export_glb
 from avp_habitat.scenes.loader import load_scene
+from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.scenes.mesh import TexturedMesh
 from avp_habitat.settings import ACTION_NAMES, TaskSettings
 from avp_habitat.simulators.raycast import RaycastSimulator
@@ -53,7 +54,7 @@ class Case:
 def _parser() -> argparse.ArgumentParser:
     made = reporting.parser(__doc__, "scenes")
     add = made.add_argument
-    add("--room", default="builtin:1", help="the room to subdivide: builtin:SEED, or a mesh")
+    add("--room", default="builtin:1", help=f"the room to subdivide: {SCENES}")
     add("--triangles", default=[10_000, 100_000, 1_000_000], type=int, nargs="*", help="about so many in the room")
     add("--halls", default=[25.0, 100.0, 400.0], type=float, nargs="*", help="floors of the empty halls, m²")
     add("--tables-m2", default=6.0, type=float, help="at most so much floor gets tables")

@@ -31,6 +31,7 @@ from avp_habitat.intervals import mean_and_half_width
 from avp_habitat.observation import NAMES
 from avp_habitat.policies import check_policy
 from avp_habitat.poses import Intrinsics
+from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.settings import ACTION_NAMES, MOVE_FORWARD, TaskSettings
 from avp_habitat.simulators import Simulator, make_simulator
 from avp_habitat.simulators.habitat.graphics import FIRST_DEVICE, choose_gpu, inspect_graphics
@@ -203,7 +204,7 @@ def _speed(simulator: Simulator, seed: int) -> float:
 def _parser() -> argparse.ArgumentParser:
     made = reporting.parser(__doc__, "simulators")
     add = made.add_argument
-    add("--scene", default=["builtin:0"], nargs="+", help="meshes, or builtin:SEED")
+    add("--scene", default=["builtin:0"], nargs="+", help=SCENES)
     add("--poses", default=50, type=int, help="pictures from so many poses")
     add("--actions", default=200, type=int, help="length of the walk")
     add("--walks", default=5, type=int, help="walks, each from a start of its own")

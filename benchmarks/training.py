@@ -26,6 +26,7 @@ from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.lookup.disk import ENVIRONMENT as CACHE
 from avp_habitat.rewards import check_reward
+from avp_habitat.scenes.location import HELP as SCENES
 from avp_sb3.presets import TABLE_4
 
 _BUFFER = TABLE_4.n_envs * TABLE_4.n_steps
@@ -38,7 +39,7 @@ _WAYS = 5
 def _parser() -> argparse.ArgumentParser:
     made = reporting.parser(__doc__, "training")
     add = made.add_argument
-    add("--scene", default="builtin:0", help="a mesh (.glb .gltf .ply .obj), or builtin:SEED")
+    add("--scene", default="builtin:0", help=SCENES)
     add("--reward", default="proposed", help="the reward's name")
     add("--agents", default=TABLE_4.n_envs, type=int, help="of the batched ways; divides PPO's buffer of 2048 steps")
     add("--repeats", default=3, type=int, help="turns of the five ways")

@@ -11,6 +11,7 @@ from typing import Any
 
 from avp_habitat import command
 from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.settings import OBSERVATION_NAMES, TaskSettings
 from avp_habitat.simulators import ONE_PER_PROCESS, SimulatorChoice
 from avp_habitat.simulators.options import add_simulator_options, simulator_choice
@@ -22,7 +23,7 @@ _MLFLOW = "runs:/"
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     add = parser.add_argument
-    add("--scene", default=["builtin:0"], nargs="+", help="meshes (.glb .gltf .ply .obj) or builtin:SEED; agents share")
+    add("--scene", default=["builtin:0"], nargs="+", help=f"{SCENES}; agents share several")
     add("--reward", default="proposed", help="coverage, coverage_redundancy or proposed")
     add("--observation", default="numbers", help="numbers (the paper's twelve) or map; also chooses PPO's settings")
     add("--steps", default=300_000, type=int, help="environment steps in total")

@@ -18,6 +18,7 @@ from tqdm import tqdm
 from avp_habitat import command
 from avp_habitat.provenance import git_commit
 from avp_habitat.rewards import RewardConstants
+from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.settings import TaskSettings
 
 EXPERIMENT = "avp-reward-search"
@@ -154,7 +155,7 @@ def _log(run: str | None, figures: dict[str, float]) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     add = parser.add_argument
-    add("--scene", nargs="+", required=True, help="meshes or builtin:SEED")
+    add("--scene", nargs="+", required=True, help=SCENES)
     add("--trials", default=12, type=int, help="trainings, the first with the constants in use")
     add("--steps", default=400_000, type=int, help="environment steps of each")
     add("--jobs", default=2, type=int, help="trainings at a time")

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from avp_habitat.command import run
 from avp_habitat.errors import SceneError, UsageError
 from avp_habitat.scenes.loader import load_scene
+from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.scenes.mesh import TexturedMesh
 
 _UNLIT = "KHR_materials_unlit"
@@ -156,7 +157,7 @@ class _Blob:
 def main(argv: Sequence[str]) -> None:
     """Export a scene, most usefully a generated room, for other programs."""
     parser = argparse.ArgumentParser(prog="python -m avp_habitat.scenes.export", description=main.__doc__)
-    parser.add_argument("scene", help="path of a .glb, .gltf, .ply or .obj file, or builtin:SEED")
+    parser.add_argument("scene", help=SCENES)
     parser.add_argument("out", type=Path, help="the .glb file to write; must not exist")
     arguments = parser.parse_args(argv)
     export_glb(load_scene(arguments.scene).mesh, arguments.out)

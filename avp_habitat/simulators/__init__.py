@@ -48,7 +48,7 @@ def make_simulator(name: str, scene: str, *, gpu: int | None = None, navmesh: st
 
     Args:
         name: `raycast` or `habitat`.
-        scene: a mesh file, or `builtin:SEED`; `habitat` takes more (its class says what).
+        scene: as `avp_habitat.scenes.location.locate` takes it.
         gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
         navmesh: file of the scene's NavMesh for `habitat`; computed when omitted.
 

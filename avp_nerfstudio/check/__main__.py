@@ -13,6 +13,7 @@ from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.rollout import Rollout
 from avp_habitat.scenes.loader import Scene, load_scene
+from avp_habitat.scenes.location import HELP as SCENES
 from avp_nerfstudio.check.outputs import choose_folder, outputs_of_geometry, write_outputs
 from avp_nerfstudio.check.shape import check_format
 from avp_nerfstudio.check.verdict import Verdict
@@ -35,7 +36,7 @@ class Request:
     out: Path
     """Where the results go."""
     mesh: str | None = None
-    """The scene, a file or `builtin:SEED`."""
+    """The scene, as `avp_habitat.scenes.location.locate` takes it."""
     export_colmap: Path | None = None
     """Where to write a COLMAP model."""
     pictures: bool = True
@@ -107,7 +108,7 @@ def _request(argv: Sequence[str]) -> Request:
     )
     add = parser.add_argument
     add("rollout", type=Path, metavar="ROLLOUT", help="the folder made by `python -m avp_habitat.collect`")
-    add("--mesh", metavar="SCENE", help="also measure the distance to this scene (.glb .gltf .ply .obj, builtin:SEED)")
+    add("--mesh", metavar="SCENE", help=f"also measure the distance to this scene: {SCENES}")
     add("--export-colmap", type=Path, metavar="DIR", help="also write the rollout as a COLMAP model; must not exist")
     add("--out", type=Path, metavar="DIR", help="where the results go (default: ROLLOUT-check, beside the rollout)")
     add("--no-pictures", action="store_true", help="leave out what is found in the pictures (pycolmap), which is slow")
