@@ -50,7 +50,7 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
             scene: as `avp_habitat.scenes.location.locate` takes it.
             simulator: `raycast`, `habitat`, or one that is open already (the scene's name is then its own).
             gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
-            navmesh: file of the scene's NavMesh for `habitat`; computed when omitted.
+            navmesh: file of the scene's NavMesh; computed when omitted.
             render_mode: None, or `rgb_array`: the camera's picture beside the top-down map.
             settings: of the task; the design's defaults when omitted.
             **overrides: single fields of `TaskSettings`, for example `reward="coverage"`, `budget=60`, `width=64`.

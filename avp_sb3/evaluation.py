@@ -95,7 +95,7 @@ class Contestant:
             settings: of the task; visibility is always computed, never looked up.
             simulator: the simulator's name.
             gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
-            navmesh: file of the scene's NavMesh for `habitat`; computed when omitted.
+            navmesh: file of the scene's NavMesh; computed when omitted.
             observation: kind of observation; what the model was trained on when omitted.
             stochastic: sample a model's actions instead of taking the likeliest.
 

@@ -90,7 +90,7 @@ class EvaluationCallback(BaseCallback):
             settings: of the task; those of the training's environment when omitted, also whether views are looked up.
             simulator: that opens the scenes; with `habitat` each of them is in a process of its own.
             gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
-            navmesh: file of the only scene's NavMesh for `habitat`; computed when omitted.
+            navmesh: file of the only scene's NavMesh; computed when omitted.
             verbose: 1 prints when a better model is kept.
 
         Raises:

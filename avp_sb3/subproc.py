@@ -57,7 +57,7 @@ class AVPSubprocVecEnv(VecEnv):
             simulator: `raycast` or `habitat`.
             gpu: the CUDA device of `habitat`, or several, of which worker i takes number i modulo their number; -1
                 for none, None for the first one there is.
-            navmesh: file of the only scene's NavMesh for `habitat`; computed when omitted.
+            navmesh: file of the only scene's NavMesh; computed when omitted.
             settings: of the task; when omitted, the design's defaults, looked up where the simulator casts rays.
             seed: of the starts; agent i uses `seed + i`.
             start_method: `forkserver` or `spawn`.

@@ -46,7 +46,7 @@ class AVPVecEnv(VecEnv):
             agents: n, at least 1, and at least one for each scene.
             simulator: a simulator's name, or those that are open already, one for each scene (names are then theirs).
             gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
-            navmesh: file of the only scene's NavMesh for `habitat`; computed when omitted.
+            navmesh: file of the only scene's NavMesh; computed when omitted.
             settings: of the task; when omitted, the design's defaults, looked up where the simulator casts rays.
             seed: of the starts; agent i uses `seed + i`, as SB3 seeds separate environments.
 

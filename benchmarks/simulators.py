@@ -2,16 +2,17 @@
 
 Needs habitat-sim. Pictures: both simulators look from the same poses at 640x480; depth is compared away from edges,
 which are the pixels where inverse depth bends (it is linear over the picture of a plane). Areas: navigable cells, which
-both lay in the same places. Walks: the same actions from the same start. `own`: each simulator in its own navigable
-area, whose walls differ by up to a voxel, so that two agents may part at a corner; `shared`: both in Habitat-Sim's.
-`frontier` actions are those that this baseline chooses in raycast, `random` ones are forward as often as all others
-together and run into walls. The observation is compared until the first contact, and where the area is shared to the
-end.
+both lay in the same places. Walks: the same actions from the same start. `own`: each simulator in the area that it
+computes, whose walls differ by up to a voxel, so that two agents may part at a corner; `file`: both with the NavMesh
+that `avp_habitat.save_navmesh` writes. `frontier` actions are those that this baseline chooses in raycast, `random`
+ones are forward as often as all others together and run into walls. The observation is compared until the first
+contact, and with the file to the end.
 """
 
 import argparse
 import os
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ from avp_habitat.poses import Intrinsics
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.settings import ACTION_NAMES, MOVE_FORWARD, TaskSettings
 from avp_habitat.simulators import Simulator, make_simulator
+from avp_habitat.simulators.habitat import HabitatSimulator
 from avp_habitat.simulators.habitat.graphics import FIRST_DEVICE, choose_gpu, inspect_graphics
 from avp_sb3.evaluation import evaluate_policy
 
@@ -122,18 +124,6 @@ class Walk:
     """`(n, 12)` absolute differences as shares of each number's range."""
 
 
-def in_area_of(simulator: Simulator, other: Simulator) -> Simulator:
-    """A simulator whose agents walk in the area of another one."""
-
-    class InArea:
-        area = other.area
-
-        def __getattr__(self, name: str) -> Any:
-            return getattr(simulator, name)
-
-    return cast(Simulator, InArea())
-
-
 def compare_walks(
     one: Simulator, other: Simulator, actions: NDArray[np.integer], start: dict[str, Any], *, seed: int = 0
 ) -> Walk:
@@ -161,6 +151,16 @@ def random_actions(count: int, seed: int) -> NDArray[np.int64]:
     moves = len(ACTION_NAMES) - 1
     weights = [0.5] + [0.5 / (moves - 1)] * (moves - 1)
     return np.random.default_rng(seed).choice(moves, size=count, p=weights)
+
+
+def with_navmesh_of(habitat: HabitatSimulator, scene: str) -> Simulator:
+    """`raycast` of a scene with the NavMesh of the other simulator."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.navmesh"
+        habitat.save_navmesh(path)
+        simulator = make_simulator("raycast", scene, navmesh=path)
+        assert simulator.area is not None  # Read now, while the file is there.
+    return simulator
 
 
 def frontier_actions(simulator: Simulator, count: int, start: dict[str, Any], seed: int) -> NDArray[np.int64]:
@@ -227,10 +227,10 @@ def main(argv: Sequence[str]) -> None:
             results[name] = []
         for scene in tqdm(options.scene, desc="scenes", disable=None):
             raycast = make_simulator("raycast", scene)
-            habitat = make_simulator("habitat", scene, gpu=options.gpu)
+            habitat = cast(HabitatSimulator, make_simulator("habitat", scene, gpu=options.gpu))
             if not results["simulators"]:
                 results["simulators"] = [_about(each, options.gpu) for each in (raycast, habitat)]
-            _one_scene(raycast, habitat, options, results)
+            _one_scene(raycast, habitat, with_navmesh_of(habitat, scene), options, results)
             _policies(scene, raycast.scene, options, results)
             rows.append(_side_by_side(raycast, habitat, options.seed))
             habitat.close()
@@ -275,7 +275,13 @@ def _side_by_side(raycast: Simulator, habitat: Simulator, seed: int) -> NDArray[
     return np.concatenate([one[0], other[0], apart], axis=1)[::2, ::2]
 
 
-def _one_scene(raycast: Simulator, habitat: Simulator, options: argparse.Namespace, results: reporting.Results) -> None:
+def _one_scene(
+    raycast: Simulator,
+    habitat: Simulator,
+    same: Simulator,
+    options: argparse.Namespace,
+    results: reporting.Results,
+) -> None:
     scene = {"scene": raycast.scene}
     seen = compare_pictures(raycast, habitat, scattered_poses(raycast, options.poses, options.seed))
     median, p99 = np.quantile(seen.depth_m, [0.5, 0.99])
@@ -296,10 +302,10 @@ def _one_scene(raycast: Simulator, habitat: Simulator, options: argparse.Namespa
             "random": random_actions(options.actions, seed),
         }
         for kind, chosen in actions.items():
-            for area, first in (("own", raycast), ("shared", in_area_of(raycast, habitat))):
+            for navmesh, first in (("own", raycast), ("file", same)):
                 walk = compare_walks(first, habitat, chosen, start)
-                row = {"area": area, "actions": kind, "seed": seed}
-                results["walks"].append(scene | row | walk_figures(walk, whole=area == "shared"))
+                row = {"navmesh": navmesh, "actions": kind, "seed": seed}
+                results["walks"].append(scene | row | walk_figures(walk, whole=navmesh == "file"))
     speeds = [_speed(simulator, options.seed) for simulator in (raycast, habitat)]
     results["speed"].append(scene | {"raycast_steps_s": speeds[0], "habitat_steps_s": speeds[1]})
 

@@ -12,7 +12,6 @@ from avp_sb3.evaluate import main as evaluate
 
 WRONG = [
     (["--gpu", "0"], "--gpu: is of the simulator 'habitat', but 'raycast' was chosen; leave it out, or choose"),
-    (["--navmesh", "a.navmesh"], "--navmesh: is of the simulator 'habitat', but 'raycast' was chosen"),
     (["--simulator", "habitat", "--gpu", "-2"], "--gpu: expected a CUDA device from 0, or -1 for none, got -2"),
     (["--simulator", "habitatt"], "unknown simulator 'habitatt': expected one of habitat, raycast; did you mean"),
 ]
@@ -42,8 +41,16 @@ def test_commands_refuse_options_that_cannot_be_right(tmp_path, monkeypatch, cap
 def test_options_of_another_simulator_are_refused_everywhere(make):
     with pytest.raises(UsageError, match=r"^gpu: is of the simulator 'habitat', but 'raycast' was chosen"):
         make(gpu=-1)
-    with pytest.raises(UsageError, match=r"^navmesh: is of the simulator 'habitat'"):
-        make(navmesh="a.navmesh")
+
+
+def test_a_missing_navmesh_is_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "room.navmesh").touch()
+    line = ["--scene", "builtin:0", "--policy", "random", "--out", "r", "--navmesh", "rom.navmesh"]
+    assert command.run(collect, line) == 1
+    told = capsys.readouterr().err
+    assert told == "error: rom.navmesh: no such NavMesh file (.navmesh); did you mean room.navmesh?\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["room.navmesh"]
 
 
 @pytest.mark.parametrize("gpu", [-2, True, "0", 1.0])

@@ -84,8 +84,10 @@ class SceneTables:
         """`(slots, words)`: bit c % 64 of word c // 64 says whether cell c is seen from the slot's place."""
         self.statistics = np.zeros((0, panorama.YAWS, len(key.pitches), 2), dtype=np.uint16)
         """`(slots, yaws, pitches, 2)` least and mean depth, 65535 for the whole range."""
-        name = hashlib.sha256(f"{simulator.scene_digest} {_VERSION} {astuple(key)}".encode()).hexdigest()[:32]
-        self._files = TileFiles(name)
+        # Bits stand for cells: another NavMesh of the same scene has others.
+        content = hashlib.sha256(simulator.area.centres.tobytes())
+        content.update(f"{simulator.scene_digest} {_VERSION} {astuple(key)}".encode())
+        self._files = TileFiles(content.hexdigest()[:32])
 
     def around(self, position: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         """The slots around places, made now where they are new.

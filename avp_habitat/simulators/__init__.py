@@ -21,11 +21,11 @@ __all__ = [
 ]
 
 
-def _raycast(scene: str, _choice: SimulatorChoice) -> Simulator:
+def _raycast(scene: str, choice: SimulatorChoice) -> Simulator:
     from avp_habitat.scenes.loader import load_scene
     from avp_habitat.simulators.raycast import RaycastSimulator
 
-    return RaycastSimulator(load_scene(scene))
+    return RaycastSimulator(load_scene(scene), choice.navmesh)
 
 
 def _habitat(scene: str, choice: SimulatorChoice) -> Simulator:
@@ -50,7 +50,7 @@ def make_simulator(name: str, scene: str, *, gpu: int | None = None, navmesh: st
         name: `raycast` or `habitat`.
         scene: as `avp_habitat.scenes.location.locate` takes it.
         gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
-        navmesh: file of the scene's NavMesh for `habitat`; computed when omitted.
+        navmesh: file of the scene's NavMesh (`.navmesh`); computed when omitted.
 
     Raises:
         UsageError: no such simulator, an option that it does not have, or a scene name that cannot be right.

@@ -7,7 +7,7 @@ from pathlib import Path
 from avp_habitat.errors import UsageError, unknown_name
 
 SIMULATOR_NAMES = ("raycast", "habitat")
-_WITH_OPTIONS = "habitat"
+_WITH_GPU = "habitat"
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class SimulatorChoice:
     gpu: int | None = None
     """Habitat's CUDA device; -1 for none, None for the first one that EGL offers."""
     navmesh: Path | None = None
-    """File of Habitat's NavMesh of the scene; computed when None."""
+    """File of the scene's NavMesh; computed when None."""
 
     @classmethod
     def of(cls, name: str, *, gpu: int | None = None, navmesh: str | Path | None = None) -> "SimulatorChoice":
@@ -61,14 +61,11 @@ class SimulatorChoice:
             raise unknown_name("simulator", self.name, SIMULATOR_NAMES)
         if self.gpu is not None and (isinstance(self.gpu, bool) or not isinstance(self.gpu, int) or self.gpu < -1):
             raise UsageError(f"{prefix}gpu: expected a CUDA device from 0, or -1 for none, got {self.gpu!r}")
-        if self.name == _WITH_OPTIONS:
-            return
-        for option in ("gpu", "navmesh"):
-            if getattr(self, option) is not None:
-                raise UsageError(
-                    f"{prefix}{option}: is of the simulator {_WITH_OPTIONS!r}, but {self.name!r} was chosen; leave it "
-                    f"out, or choose {_WITH_OPTIONS!r}"
-                )
+        if self.gpu is not None and self.name != _WITH_GPU:
+            raise UsageError(
+                f"{prefix}gpu: is of the simulator {_WITH_GPU!r}, but {self.name!r} was chosen; leave it out, or "
+                f"choose {_WITH_GPU!r}"
+            )
 
 
 def add_simulator_options(parser: argparse.ArgumentParser) -> None:
@@ -89,7 +86,7 @@ def add_simulator_options(parser: argparse.ArgumentParser) -> None:
         default=None,
         type=Path,
         metavar="FILE",
-        help="the scene's .navmesh for habitat (default: computed for the task's agent)",
+        help="the scene's .navmesh (default: computed for the task's agent)",
     )
 
 

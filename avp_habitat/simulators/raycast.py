@@ -2,6 +2,7 @@
 
 from functools import cached_property, lru_cache
 from importlib import metadata
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,12 +27,17 @@ class RaycastSimulator:
 
     name = "raycast"
 
-    def __init__(self, scene: "Scene") -> None:
-        """Build the ray-tracing structure of `scene` (about a second per million triangles)."""
+    def __init__(self, scene: "Scene", navmesh: Path | None = None) -> None:
+        """Build the ray-tracing structure of `scene` (about a second per million triangles).
+
+        Args:
+            scene: in memory.
+            navmesh: file of the scene's NavMesh, as Habitat-Sim keeps it, instead of the area that is computed.
+        """
         self.scene = scene.name
         self.scene_digest = scene.digest
         self.version = f"open3d {metadata.version('open3d')}"
-        self._mesh = scene.mesh
+        self._mesh, self._navmesh = scene.mesh, navmesh
         self._rays = _Rays(scene.mesh.vertices, scene.mesh.triangles)
 
     @property
@@ -39,7 +45,7 @@ class RaycastSimulator:
         """Where agents can stand; computed when first asked for.
 
         Raises:
-            SceneError: the scene has no floor on which an agent can stand.
+            SceneError: the scene has no floor on which an agent can stand, or the NavMesh is not that of the scene.
         """
         return self._area
 
@@ -47,7 +53,14 @@ class RaycastSimulator:
     def _area(self) -> "NavigableArea":
         from avp_habitat.navigation.area import build_area
 
-        return build_area(self._mesh, self.surface_below)
+        own = build_area(self._mesh, self.surface_below)
+        if self._navmesh is None:
+            return own
+        from avp_habitat.navigation.islands import area_of_file
+
+        vertices = self._mesh.vertices[np.unique(self._mesh.triangles)]
+        bounds = np.stack([vertices.min(axis=0), vertices.max(axis=0)]).astype(np.float64)
+        return area_of_file(self._navmesh, own, self.surface_below, bounds)
 
     @cached_property
     def _surface(self) -> "Surface":

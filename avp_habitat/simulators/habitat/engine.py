@@ -6,6 +6,7 @@ What differs between them: sensors belong to the simulator from 0.3.4 on (`Simul
 """
 
 import ctypes
+import errno
 import json
 import math
 import os
@@ -157,18 +158,14 @@ class HabitatEngine:
         if not done or not finder.is_loaded:
             raise SceneError("Habitat-Sim found no floor for its NavMesh; is the scene Y-up, in metres?")
 
-    def load_navmesh(self, path: Path) -> dict[str, float]:
-        """Take a NavMesh from a file; returns the settings of its agent (`agent_radius`, `agent_height`, ...).
+    def save_navmesh(self, path: Path) -> None:
+        """Write the NavMesh that was made last to a new file.
 
         Raises:
-            SceneError: the file is no NavMesh, or an empty one.
+            OSError: it cannot be written.
         """
-        finder = self._sim.pathfinder
-        if not finder.load_nav_mesh(str(path)) or not finder.is_loaded:
-            raise SceneError(f"{path}: Habitat-Sim cannot read it as a NavMesh (.navmesh)")
-        settings = finder.nav_mesh_settings
-        names = ("agent_radius", "agent_height", "agent_max_climb", "agent_max_slope")
-        return {name: float(getattr(settings, name)) for name in names} if settings is not None else {}
+        if not self._sim.pathfinder.is_loaded or not self._sim.pathfinder.save_nav_mesh(str(path)):
+            raise OSError(errno.EIO, "Habitat-Sim did not write it", str(path))
 
     def islands(self) -> list[NDArray[np.float64]]:
         """The loaded NavMesh's connected parts, each as `(k, 3, 3)` corners of triangles in metres."""

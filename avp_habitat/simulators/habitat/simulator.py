@@ -18,6 +18,7 @@ from avp_habitat.simulators.base import Frames
 from avp_habitat.simulators.habitat import process
 from avp_habitat.simulators.habitat.graphics import choose_gpu
 from avp_habitat.simulators.habitat.installed import require_installed
+from avp_habitat.simulators.habitat.navmesh_file import check_navmesh
 from avp_habitat.simulators.habitat.stage import write_stage
 
 if TYPE_CHECKING:
@@ -51,7 +52,6 @@ class HabitatSimulator:
         require_installed()
         device = choose_gpu(gpu)
         location = locate(scene)
-        path = _navmesh_file(navmesh)
         self.scene, self.scene_digest = location.name, scene_digest(location)
         self._engine = _open(scene, location, device)
         self._closing = weakref.finalize(self, _close, self._engine)
@@ -60,7 +60,7 @@ class HabitatSimulator:
             from avp_habitat.simulators.habitat.navmesh import navmesh_area
 
             _check_objects(location, self._engine.objects)
-            self._area = navmesh_area(self._engine, path)
+            self._area = navmesh_area(self._engine, None if navmesh is None else Path(navmesh))
         except BaseException as error:
             self.close()
             if isinstance(error, SceneError):
@@ -92,6 +92,14 @@ class HabitatSimulator:
         among = np.stack([camera.reshape(-1), pairs[:, 1]], axis=1)
         return visible_in_depth(poses, _COVERAGE_CAMERA, depth, points, among, tolerance_m=tolerance_m)
 
+    def save_navmesh(self, path: Path) -> None:
+        """Write the NavMesh that was computed for the design's agent to a new `.navmesh` file.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self._engine.save_navmesh(path)
+
     def close(self) -> None:
         """Free the simulator and its graphics context; another one can then be opened in this process."""
         self._closing()
@@ -122,12 +130,3 @@ def _check_objects(location: SceneLocation, shown: int) -> None:
             f"has {location.objects} objects, but Habitat-Sim shows {shown} of them without its physics (Bullet), "
             "which articulated objects need; use a scene without those, or its stage alone"
         )
-
-
-def _navmesh_file(navmesh: str | Path | None) -> Path | None:
-    if navmesh is None:
-        return None
-    path = Path(navmesh)
-    if not path.is_file():
-        raise SceneError(f"{path}: no such NavMesh file (.navmesh)")
-    return path

@@ -1,0 +1,70 @@
+"""`python -m avp_habitat.save_navmesh`: keep Habitat-Sim's NavMesh of a scene as a file, for both simulators."""
+
+import argparse
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from avp_habitat import command
+from avp_habitat.errors import SceneError, UsageError
+from avp_habitat.scenes.location import HELP
+
+
+def save_navmesh(scene: str, out: Path, *, gpu: int | None = None) -> float:
+    """Compute a scene's NavMesh for the task's agent and write it.
+
+    Args:
+        scene: as for `avp_habitat.scenes.location.locate`.
+        out: the file; appears only when it is complete.
+        gpu: CUDA device for Habitat-Sim, see `HabitatSimulator`.
+
+    Returns:
+        The navigable area in square metres.
+
+    Raises:
+        UsageError: the name does not end in `.navmesh`, or the file exists.
+        SceneError: the scene cannot be used, or the file cannot be written.
+        SimulatorError: Habitat-Sim cannot run here.
+    """
+    if out.suffix != ".navmesh":
+        raise UsageError(f"{out}: expected a name that ends in .navmesh")
+    if out.exists():
+        raise UsageError(f"{out}: exists already; remove it or choose another name")
+    if not out.parent.is_dir():
+        raise UsageError(f"{out}: there is no folder {out.parent}")
+    from avp_habitat.simulators.habitat import HabitatSimulator
+
+    simulator = HabitatSimulator(scene, gpu=gpu)
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
+            made = Path(folder) / out.name
+            simulator.save_navmesh(made)
+            os.replace(made, out)
+    except OSError as error:
+        raise SceneError(f"{out}: cannot be written: {error.strerror}") from error
+    finally:
+        simulator.close()
+    return simulator.area.area_m2
+
+
+def main(argv: Sequence[str]) -> None:
+    """Write the file, say what it is for."""
+    parser = argparse.ArgumentParser(
+        prog="python -m avp_habitat.save_navmesh",
+        description="Keep Habitat-Sim's NavMesh of a scene, computed for the task's agent, as a file that both "
+        "simulators take by --navmesh, so that agents walk in exactly the same area in both.",
+    )
+    parser.add_argument("--scene", required=True, help=HELP)
+    parser.add_argument("--out", required=True, type=Path, help="the .navmesh file to write; must not exist")
+    parser.add_argument(
+        "--gpu", type=int, metavar="N", help="CUDA device, -1 for none (default: the first one there is)"
+    )
+    options = parser.parse_args(argv)
+    area = save_navmesh(options.scene, options.out, gpu=options.gpu)
+    print(f"{options.out}: {area:.2f} m² navigable; give it to both simulators by --navmesh {options.out}")
+
+
+if __name__ == "__main__":
+    sys.exit(command.run(main))
