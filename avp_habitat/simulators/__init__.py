@@ -66,7 +66,7 @@ def open_simulator(choice: SimulatorChoice, scene: str) -> Simulator:
     path = Path(scene)
     key = (choice, str(path.resolve()), path.stat().st_mtime) if path.is_file() else (choice, scene, 0.0)
     simulator = _shared.get(key)
-    if simulator is None:
+    if simulator is None or _is_closed(simulator):
         if choice.name in ONE_PER_PROCESS:
             _check_alone(choice.name, scene)
         simulator = _FACTORIES[choice.name](scene, choice)
@@ -93,4 +93,10 @@ def _check_alone(name: str, scene: str) -> None:
 
 
 def _open_already(name: str) -> list[str]:
-    return [simulator.scene for (choice, _, _), simulator in list(_shared.items()) if choice.name == name]
+    opened = [simulator for (choice, _, _), simulator in list(_shared.items()) if choice.name == name]
+    return [simulator.scene for simulator in opened if not _is_closed(simulator)]
+
+
+def _is_closed(simulator: Simulator) -> bool:
+    """Whether somebody closed it before its last user was done."""
+    return getattr(simulator, "closed", False)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.coverage import visible_in_depth
-from avp_habitat.errors import SceneError
+from avp_habitat.errors import SceneError, SimulatorError
 from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.poses import Intrinsics
 from avp_habitat.scenes.loader import scene_digest
@@ -18,7 +18,6 @@ from avp_habitat.simulators.base import Frames
 from avp_habitat.simulators.habitat import process
 from avp_habitat.simulators.habitat.graphics import choose_gpu
 from avp_habitat.simulators.habitat.installed import require_installed
-from avp_habitat.simulators.habitat.navmesh_file import check_navmesh
 from avp_habitat.simulators.habitat.stage import write_stage
 
 if TYPE_CHECKING:
@@ -68,6 +67,11 @@ class HabitatSimulator:
             raise
 
     @property
+    def closed(self) -> bool:
+        """Whether it was closed, after which it shows nothing any more."""
+        return not self._closing.alive
+
+    @property
     def area(self) -> NavigableArea:
         """The largest island of Habitat's NavMesh, recomputed for the design's agent unless a file was given."""
         return self._area
@@ -75,6 +79,8 @@ class HabitatSimulator:
     def render(self, camera_to_world: NDArray[np.floating], intrinsics: Intrinsics, *, rgb: bool) -> Frames:
         """Depth, and colour when asked for, of `(n, 4, 4)` habitat poses; see `simulators.base.Simulator.render`."""
         process.check_process(self.scene)
+        if self.closed:
+            raise SimulatorError(f"habitat: the simulator of {self.scene} was closed; open the scene again")
         return self._engine.render(camera_to_world, intrinsics, rgb=rgb)
 
     def visible(
