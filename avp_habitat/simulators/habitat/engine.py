@@ -196,7 +196,8 @@ class HabitatEngine:
         sensor = self._sensors.get((camera, rgb))
         if sensor is None:
             specification = self._camera(camera, rgb=rgb)
-            self._sim.add_sensor(specification)
+            if specification.uuid not in self._registered():
+                self._sim.add_sensor(specification)
             sensor = self._sensors[camera, rgb] = self._registered()[specification.uuid]
         sensor.draw_observation()
         return np.asarray(sensor.get_observation())
