@@ -291,7 +291,7 @@ def test_a_given_navmesh_counts_and_one_for_another_agent_warns(opened, tmp_path
             (2.5, 0, 1.5),
             r"another scene\? Only \d+ % of its area .* holds \d+ % of that one's; expected 85 % of either",
         ),
-        ((20, 0, 0), r"another scene\? The open one has no floor below it$"),
+        ((20, 0, 0), r"another scene\? no ray meets the floor"),
     ],
 )
 def test_the_navmesh_of_another_scene_is_refused_with_figures(opened, tmp_path, shift, message):
