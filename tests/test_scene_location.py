@@ -123,6 +123,13 @@ def test_the_folder_of_all_scenes_brings_one_of_them(room):
         locate(str(room.parent))
 
 
+def test_a_misspelt_folder_of_replica_brings_the_nearest_one(room):
+    with pytest.raises(SceneError, match=r"/rom_0: no such folder; did you mean room_0\?$"):
+        locate(str(room.with_name("rom_0")))
+    with pytest.raises(UsageError, match=r"/kitchen: expected a scene file .* no suffix"):
+        locate(str(room.with_name("kitchen")))
+
+
 def test_a_scene_of_replica_without_its_mesh_is_named(room):
     (room / "mesh.ply").unlink()
     with pytest.raises(SceneError, match=r"room_0/mesh.ply: no such scene file"):

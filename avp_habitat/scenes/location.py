@@ -5,7 +5,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from avp_habitat.errors import SceneError, UsageError
+from avp_habitat.errors import AVPError, SceneError, UsageError
 from avp_habitat.scenes import replica
 from avp_habitat.scenes.files import SUFFIXES
 from avp_habitat.scenes.stage_config import STAGE_CONFIG, Y_UP, Z_UP, Layer, Vector, read_config, read_stage
@@ -115,7 +115,11 @@ def _in_dataset(path: Path, scene_id: str) -> SceneLocation:
     )
 
 
-def _unknown(path: Path) -> UsageError:
+def _unknown(path: Path) -> AVPError:
+    folders = replica.scenes_within(path.parent) if path.parent.is_dir() else []
+    near = difflib.get_close_matches(path.name, folders, n=2, cutoff=0.5)
+    if near:
+        return SceneError(f"{path}: no such folder; did you mean {' or '.join(near)}?")
     found = f"the suffix {path.suffix!r}" if path.suffix else "no suffix"
     return UsageError(
         f"{path}: expected a scene file ({', '.join(SUFFIXES)}), a scene folder of Replica, NAME{STAGE_CONFIG}, "
