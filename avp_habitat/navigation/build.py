@@ -121,10 +121,8 @@ def area_in_outline(
     shapes = np.asarray(shapely.polygons(triangles[:, :, [0, 2]]))
     # Neighbours share corners only up to rounding; a seam would cut the area in two.
     rings = largest_piece(shapely.union_all(shapely.buffer(shapes, SKIN_M, join_style="mitre")))
-    low, high = rings[0].min(axis=0), rings[0].max(axis=0)
-    if bounds is not None:
-        low, high = bounds[0, [0, 2]] + (settings.voxel_m - settings.cell_m) / 2, np.maximum(high, bounds[1, [0, 2]])
-    columns, rows = np.ceil((high - low) / settings.cell_m).astype(int)
+    low, size = _cells_over(rings[0], bounds, settings)
+    columns, rows = size
     x = low[0] + (np.arange(columns) + 0.5) * settings.cell_m
     z = low[1] + (np.arange(rows) + 0.5) * settings.cell_m
     centres = np.stack(np.meshgrid(x, z), axis=-1)
@@ -135,6 +133,21 @@ def area_in_outline(
     top = np.ceil(floor / step - 1e-6) * step
     # A navigation mesh follows the floor's outline; across a slope its few corners leave it well above the floor.
     return _over_cells(rings, low, mask, top, surface_below, settings, deepest_voxels=settings.height_voxels)
+
+
+def _cells_over(outer: Float, bounds: Float | None, settings: NavigationSettings) -> tuple[Float, NDArray[np.int64]]:
+    """Least corner x, z of the cells over an outline, and how many columns and rows there are."""
+    low, high = outer.min(axis=0), outer.max(axis=0)
+    if bounds is None:
+        return low, np.ceil((high - low) / settings.cell_m).astype(np.int64)
+    origin = bounds[0, [0, 2]] + (settings.voxel_m - settings.cell_m) / 2
+    # Recast rounds the number of voxels.
+    voxels = np.floor((bounds[1] - bounds[0])[[0, 2]] / settings.voxel_m + 0.5)
+    cells = np.ceil(voxels * settings.voxel_m / settings.cell_m - 1e-6).astype(np.int64)
+    # A mesh of another scene may lie beside this one.
+    before = np.maximum(np.ceil((origin - low) / settings.cell_m - 1e-6), 0).astype(np.int64)
+    after = np.maximum(np.ceil((high - origin) / settings.cell_m - 1e-6).astype(np.int64), cells)
+    return origin - before * settings.cell_m, before + after
 
 
 def _height_on(triangles: Float, shapes: NDArray, points: Float) -> Float:

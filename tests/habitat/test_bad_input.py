@@ -69,27 +69,27 @@ MISTAKES = [
     (
         "--scene room.glb --navmesh nose.navmesh",
         1,
-        r"room\.glb: nose\.navmesh: no such NavMesh file .*; did you mean noise\.navmesh\?",
+        r"nose\.navmesh: no such NavMesh file .*; did you mean noise\.navmesh\?",
     ),
     (
         "--scene room.glb --navmesh folder.navmesh",
         1,
-        r"room\.glb: folder\.navmesh: no such NavMesh file \(\.navmesh\).*",
+        r"folder\.navmesh: no such NavMesh file \(\.navmesh\).*",
     ),
     (
         "--scene room.glb --navmesh empty.navmesh",
         1,
-        r"room\.glb: empty\.navmesh: expected a NavMesh .*, but it ends after 0 bytes",
+        r"empty\.navmesh: expected a NavMesh .*, but it ends after 0 bytes",
     ),
     (
         "--scene room.glb --navmesh noise.navmesh",
         1,
-        r"room\.glb: noise\.navmesh: expected a NavMesh .*, but it does not begin as one",
+        r"noise\.navmesh: expected a NavMesh .*, but it does not begin as one",
     ),
     (
         "--scene room.glb --navmesh room.glb",
         1,
-        r"room\.glb: room\.glb: expected a NavMesh .*, but it does not begin as one",
+        r"room\.glb: expected a NavMesh .*, but it does not begin as one",
     ),
     (
         "--scene room.glb --simulator raycast --navmesh noise.navmesh",

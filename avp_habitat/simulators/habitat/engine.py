@@ -5,16 +5,11 @@ What differs between them: sensors belong to the simulator from 0.3.4 on (`Simul
 `magnum.Vector3` from 0.3.3 on.
 """
 
-import ctypes
 import errno
-import json
 import math
 import os
 import sys
-import tempfile
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,10 +22,10 @@ from avp_habitat.navigation.settings import NavigationSettings
 from avp_habitat.poses import Intrinsics
 from avp_habitat.simulators.base import Frames
 from avp_habitat.simulators.habitat.installed import cannot_load, require_installed
+from avp_habitat.simulators.habitat.quiet import quiet_stderr
+from avp_habitat.simulators.habitat.unlit import NO_IMAGE, flat_mediator
 
-_NO_IMAGE = "no-image-based-lighting"
 _NO_NAVMESH = ("Could not build Detour navmesh", "Failed to build navmesh")
-_CLONE_FS = 0x200
 
 
 @dataclass(frozen=True)
@@ -70,8 +65,8 @@ class HabitatEngine:
         self._sensors: dict[tuple[Intrinsics | OverheadCamera, bool], Any] = {}
         configuration = self._configuration(dataset, scene_id, gpu)
         try:
-            with _quiet_stderr(_NO_IMAGE) if gpu < 0 else nullcontext():
-                configuration.metadata_mediator = _mediator(self._habitat, configuration.sim_cfg, lit=gpu >= 0)
+            with quiet_stderr(NO_IMAGE) if gpu < 0 else nullcontext():
+                configuration.metadata_mediator = flat_mediator(self._habitat, configuration.sim_cfg, lit=gpu >= 0)
                 self._sim = self._habitat.Simulator(configuration)
         except Exception as error:
             # Its failed checks arrive as AssertionError, damaged files as RuntimeError, and so on.
@@ -150,7 +145,7 @@ class HabitatEngine:
             arguments = (True,)
         finder = self._sim.pathfinder
         try:
-            with _quiet_stderr(*_NO_NAVMESH):
+            with quiet_stderr(*_NO_NAVMESH):
                 done = self._sim.recompute_navmesh(finder, made, *arguments)
         except Exception as error:
             raise SceneError(f"Habitat-Sim cannot make its NavMesh: {_last_line(error)}") from error
@@ -227,60 +222,6 @@ class HabitatEngine:
         from magnum import Matrix4, Vector4  # pyright: ignore[reportMissingImports]
 
         self._node.transformation = Matrix4(*(Vector4(*column) for column in pose.T.tolist()))
-
-
-def _mediator(habitat: Any, backend: Any, *, lit: bool) -> Any:
-    """Habitat-Sim's reader of datasets, told to show objects as it shows stages: flat, since there are no lights."""
-    made = None if lit else _unlit_mediator(habitat, backend)
-    mediator = made or habitat.metadata.MetadataMediator(backend)
-    objects = mediator.object_template_manager
-    for handle in objects.get_file_template_handles():
-        template = objects.get_template_by_handle(handle)
-        template.force_flat_shading = True
-        objects.register_template(template, handle)
-    return mediator
-
-
-def _unlit_mediator(habitat: Any, backend: Any) -> Any:
-    """Habitat-Sim's reader of datasets, told not to prepare image-based lighting, which flat shading never uses.
-
-    Preparing it takes 6 to 11 s on software rendering; all of the opening takes 0.3 s without. The only way to say so
-    is a file `data/default.pbr_config.json` in the current folder when the reader is made, hence a thread with a
-    current folder of its own. Where a thread cannot have one, the lighting is prepared.
-    """
-    made: list[Any] = []
-
-    def make(folder: Path) -> None:
-        (folder / "data").mkdir()
-        names = {"enable_ibl": False, "ibl_envmap_filename": _NO_IMAGE, "ibl_blut_filename": _NO_IMAGE}
-        (folder / "data" / "default.pbr_config.json").write_text(json.dumps(names), encoding="utf-8")
-        if ctypes.CDLL(None).unshare(_CLONE_FS) == 0:
-            os.chdir(folder)
-            made.append(habitat.metadata.MetadataMediator(backend))
-
-    with tempfile.TemporaryDirectory(prefix="avp-habitat-") as folder:
-        thread = threading.Thread(target=make, args=(Path(folder),))
-        thread.start()
-        thread.join()
-    return made[0] if made else None
-
-
-@contextmanager
-def _quiet_stderr(*words: str) -> Iterator[None]:
-    """Hold back what is written to stderr, by C++ too; in the end hand on the lines that hold none of `words`."""
-    sys.stderr.flush()
-    kept = os.dup(2)
-    with tempfile.TemporaryFile() as file:
-        os.dup2(file.fileno(), 2)
-        try:
-            yield
-        finally:
-            sys.stderr.flush()
-            os.dup2(kept, 2)
-            os.close(kept)
-            file.seek(0)
-            lines = [line for line in file if not any(word.encode() in line for word in words)]
-            os.write(2, b"".join(lines)) if lines else None
 
 
 def _centred(camera: Intrinsics) -> tuple[Intrinsics, slice, slice]:

@@ -62,7 +62,7 @@ class HabitatSimulator:
             self._area = navmesh_area(self._engine, None if navmesh is None else Path(navmesh))
         except BaseException as error:
             self.close()
-            if isinstance(error, SceneError):
+            if isinstance(error, SceneError) and not str(error).startswith(str(navmesh)):
                 raise SceneError(f"{self.scene}: {error}") from error
             raise
 
