@@ -6,7 +6,8 @@ both lay in the same places. Walks: the same actions from the same start. `own`:
 computes, whose walls differ by up to a voxel, so that two agents may part at a corner; `file`: both with the NavMesh
 that `avp_habitat.save_navmesh` writes. `frontier` actions are those that this baseline chooses in raycast, `random`
 ones are forward as often as all others together and run into walls. The observation is compared until the first
-contact, and with the file to the end.
+contact, and with the file to the end. Sliding: single moves from random places, by the task's code and by Habitat-Sim's
+own filter on the same NavMesh; a contact is a move that does not arrive in one of them.
 """
 
 import argparse
@@ -44,6 +45,7 @@ SENSOR_HEIGHT_M = 1.5
 BEND_M = 0.02
 """Depth that differs by more than this from what a plane through the neighbours would have is an edge."""
 _CHUNK = 5
+_ARRIVED_M = 0.002
 _PICTURE = "Per scene: raycast, habitat, and four times their difference"
 
 
@@ -189,6 +191,28 @@ def _ranges() -> NDArray[np.float64]:
     return np.array([2.0 if name.startswith(signed) else 1.0 for name in NAMES])
 
 
+def _sliding(habitat: HabitatSimulator, moves: int, seed: int) -> dict[str, Any]:
+    """The task's way to move beside Habitat-Sim's, from random places in random directions."""
+    rng = np.random.default_rng(seed)
+    begin = habitat.area.random_points(rng, moves)
+    move = TaskSettings().forward_m * poses.heading(rng.uniform(-np.pi, np.pi, moves))
+    ours, theirs = habitat.area.slide(begin, move), habitat.native_steps(begin, move)
+    goal = begin + move
+
+    def apart(one: NDArray[np.floating], other: NDArray[np.floating]) -> NDArray[np.floating]:
+        return np.linalg.norm((one - other)[:, [0, 2]], axis=1)
+
+    between = apart(ours, theirs)
+    contact = np.maximum(apart(ours, goal), apart(theirs, goal)) > _ARRIVED_M
+    return {
+        "moves": moves,
+        "free_apart_mm": 1e3 * between[~contact].max(initial=0.0),
+        "contacts": int(contact.sum()),
+        "contacts_apart_percent": 100 * float((between[contact] > _ARRIVED_M).mean()),
+        "most_apart_mm": 1e3 * between.max(),
+    }
+
+
 def _speed(simulator: Simulator, seed: int) -> float:
     """Steps per second of one environment, random actions, the policy's camera."""
     env = AVPEnv(simulator=simulator, settings=TaskSettings(reward="coverage"))
@@ -208,6 +232,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--poses", default=50, type=int, help="pictures from so many poses")
     add("--actions", default=200, type=int, help="length of the walk")
     add("--walks", default=5, type=int, help="walks, each from a start of its own")
+    add("--moves", default=4000, type=int, help="single moves that are compared with Habitat-Sim's own")
     add("--policy", default=[], nargs="*", help="baselines' names or PPO models (.zip) to evaluate in both")
     add("--episodes", default=20, type=int, help="per policy, scene and simulator, from the same starts")
     add("--seed", default=0, type=int, help="of poses, starts and actions")
@@ -218,12 +243,12 @@ def _parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str]) -> None:
     """Compare, print and write."""
     options = _parser().parse_args(argv)
-    reporting.check_least(options, poses=1, actions=1, walks=1, episodes=1, seed=0)
+    reporting.check_least(options, poses=1, actions=1, walks=1, moves=1, episodes=1, seed=0)
     for policy in options.policy:
         check_policy(policy)
     rows = []
     with reporting.reported("simulators", options) as results:
-        for name in ("simulators", "pictures", "areas", "walks", "policies", "speed"):
+        for name in ("simulators", "pictures", "areas", "walks", "sliding", "policies", "speed"):
             results[name] = []
         for scene in tqdm(options.scene, desc="scenes", disable=None):
             raycast = make_simulator("raycast", scene)
@@ -277,7 +302,7 @@ def _side_by_side(raycast: Simulator, habitat: Simulator, seed: int) -> NDArray[
 
 def _one_scene(
     raycast: Simulator,
-    habitat: Simulator,
+    habitat: HabitatSimulator,
     same: Simulator,
     options: argparse.Namespace,
     results: reporting.Results,
@@ -306,6 +331,7 @@ def _one_scene(
                 walk = compare_walks(first, habitat, chosen, start)
                 row = {"navmesh": navmesh, "actions": kind, "seed": seed}
                 results["walks"].append(scene | row | walk_figures(walk, whole=navmesh == "file"))
+    results["sliding"].append(scene | _sliding(habitat, options.moves, options.seed))
     speeds = [_speed(simulator, options.seed) for simulator in (raycast, habitat)]
     results["speed"].append(scene | {"raycast_steps_s": speeds[0], "habitat_steps_s": speeds[1]})
 

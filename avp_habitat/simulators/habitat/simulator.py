@@ -98,6 +98,22 @@ class HabitatSimulator:
         among = np.stack([camera.reshape(-1), pairs[:, 1]], axis=1)
         return visible_in_depth(poses, _COVERAGE_CAMERA, depth, points, among, tolerance_m=tolerance_m)
 
+    def native_steps(self, positions: NDArray[np.floating], displacements: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Where Habitat-Sim's own filter (`PathFinder.try_step`) lets agents arrive, on the NavMesh that it computed.
+
+        For comparison only: the task's agents move by `area.slide`, in both simulators.
+
+        Args:
+            positions: `(n, 3)` metres, over the area.
+            displacements: `(n, 3)` metres.
+
+        Returns:
+            `(n, 3)` metres, at the NavMesh's heights.
+        """
+        process.check_process(self.scene)
+        ends = np.asarray(positions) + displacements
+        return np.stack([self._engine.try_step(*step) for step in zip(positions, ends, strict=True)])
+
     def save_navmesh(self, path: Path) -> None:
         """Write the NavMesh that was computed for the design's agent to a new `.navmesh` file.
 
