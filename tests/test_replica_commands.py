@@ -208,7 +208,9 @@ def test_the_whole_page_runs_from_top_to_bottom(place, data, shared, name):
         assert rollout.meta["reward"] == (policy if policy in REWARDS else "proposed")
         assert len(rollout.frames) <= 6
         assert same_poses(rollout.heldout, rollouts["proposed"].heldout)
-        assert same_poses(rollout.frames[:1], rollouts["proposed"].frames[:1])
+        # A frame is taken after a step, and the first steps differ.
+        first, other = (found.frames[0].camera_to_world[:3, 3] for found in (rollout, rollouts["proposed"]))
+        assert np.linalg.norm(first - other) <= 0.25 + 1e-6
     for captured in ("room_0-heuristic", "room_0-proposed", "room_2-proposed"):
         scores = json.loads((results / "scores" / f"{captured}.json").read_text())["results"]
         assert all(math.isfinite(scores[score]) for score in ("psnr", "ssim", "lpips"))
