@@ -86,7 +86,7 @@ def reported(name: str, options: argparse.Namespace) -> Iterator[Results]:
         Where to put the rows of each table as they are measured.
     """
     results: Results = {}
-    complete = False
+    complete, commit = False, git_commit()
     try:
         yield results
         complete = True
@@ -94,7 +94,7 @@ def reported(name: str, options: argparse.Namespace) -> Iterator[Results]:
         if any(results.values()):
             for title, rows in results.items():
                 print_table(title, rows)
-            write_report(options.out, name, options, complete=complete, results=results)
+            write_report(options.out, name, options, complete=complete, commit=commit, results=results)
 
 
 @contextmanager
@@ -111,7 +111,9 @@ def own_folders(folder: Path) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def write_report(path: Path, name: str, options: argparse.Namespace, *, complete: bool, results: Results) -> None:
+def write_report(
+    path: Path, name: str, options: argparse.Namespace, *, complete: bool, commit: str | None, results: Results
+) -> None:
     """Write the JSON report and say where it is.
 
     Args:
@@ -119,6 +121,7 @@ def write_report(path: Path, name: str, options: argparse.Namespace, *, complete
         name: of the benchmark.
         options: parsed.
         complete: False when Ctrl-C ended the measurements.
+        commit: of the checkout when they began.
         results: rows by the name of their table.
 
     Raises:
@@ -131,7 +134,7 @@ def write_report(path: Path, name: str, options: argparse.Namespace, *, complete
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
         "options": {key: _plain(value) for key, value in vars(options).items()},
-        "git_commit": git_commit(),
+        "git_commit": commit,
         "versions": installed_versions(_PACKAGES),
         "machine": machine(),
         "results": results,
