@@ -47,7 +47,7 @@ class MapObserver:
             yaw: `(k,)` radians.
 
         Returns:
-            `(k, SIZE)` within [0, 1]: channel after channel, row after row from ahead to behind, left to right. What
+            `(k, SIZE)` within [0, 1], channel after channel, row after row from ahead to behind, left to right. What
             lies beyond the map is drawn on its border, frontiers only.
         """
         from avp_habitat.map_kernel import draw

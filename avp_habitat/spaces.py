@@ -16,7 +16,7 @@ def observation_space(kind: str) -> gymnasium.Space[NDArray[np.float32]]:
         kind: one of `settings.OBSERVATION_NAMES`.
 
     Returns:
-        float32; `(12,)` for `numbers`, `(13 + map_observation.SIZE,)` for `map`: the numbers, whether C ≥ τ, the map.
+        float32; `(12,)` for `numbers`, `(13 + map_observation.SIZE,)` (the numbers, whether C ≥ τ, the map) for `map`.
     """
     low, high = LOW, HIGH
     if kind == "map":

@@ -52,8 +52,8 @@ def camera_path(folder: str | Path, film: Film) -> dict[str, Any]:
     """A rollout's walk in the form in which nerfstudio's viewer saves a path.
 
     Returns:
-        What `nerfstudio.cameras.camera_paths.get_path_from_json` reads: 4x4 camera_to_world, row by row, OpenGL camera
-        axes, Z up, metres times `film.scale`, as avp-data gives the poses.
+        What `nerfstudio.cameras.camera_paths.get_path_from_json` reads, with 4x4 camera_to_world, row by row,
+        OpenGL camera axes, Z up, metres times `film.scale`, as avp-data gives the poses.
 
     Raises:
         RolloutError: the rollout cannot be read, or its camera never moves.
