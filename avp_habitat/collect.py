@@ -60,7 +60,7 @@ def collect(request: Request) -> dict[str, Any]:
     """Collect one rollout.
 
     Returns:
-        The metrics written to `rollout.json`: coverage, views, annd_m, ei, … (see `task.episode_metrics`).
+        The metrics written to `rollout.json`, which are those of `task.episode_metrics`, and visibility.
 
     Raises:
         UsageError: a name is unknown or the folder exists.
@@ -74,7 +74,7 @@ def collect(request: Request) -> dict[str, Any]:
         with tqdm(total=total, unit="view", desc=f"collecting {request.out}", disable=None) as progress:
             info = _capture_episode(request, env, policy, writer, progress)
             capture_heldout(env, writer, request.heldout, progress=progress.update)
-        publish_rollout(
+        return publish_rollout(
             env,
             writer,
             info,
@@ -83,7 +83,6 @@ def collect(request: Request) -> dict[str, Any]:
             heldout=request.heldout,
             mlflow_run_id=getattr(policy, "avp_mlflow_run_id", None) or os.environ.get("MLFLOW_RUN_ID"),
         )
-    return info["avp_episode"]
 
 
 def _capture_episode(

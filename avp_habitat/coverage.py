@@ -73,13 +73,13 @@ def visible_in_depth(
     inverse = np.where(depth > 0, 1.0 / np.maximum(depth, 1e-6), 0.0)
     reach = planar * (1.0 - tolerance_m / np.maximum(distance, tolerance_m))
     limit = 1.0 / np.maximum(reach, 1e-6)
-    between = _bilinear(inverse, camera, u - 0.5, v - 0.5)
+    between = bilinear(inverse, camera, u - 0.5, v - 0.5)
     row = np.clip(v.astype(np.int64), 0, intrinsics.height - 1)
     column = np.clip(u.astype(np.int64), 0, intrinsics.width - 1)
     return (between <= limit) | (inverse[camera, row, column] <= limit)
 
 
-def _bilinear(images: Float, index: NDArray[np.integer], x: Float, y: Float) -> Float:
+def bilinear(images: Float, index: NDArray[np.integer], x: Float, y: Float) -> Float:
     """Values of `(n, h, w)` images at `(k,)` positions in pixels (centres at whole numbers), clamped at the border."""
     height, width = images.shape[1:]
     x, y = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)

@@ -11,6 +11,7 @@ from avp_habitat.drawing import draw_trajectory
 from avp_habitat.env import AVPEnv
 from avp_habitat.heldout import heldout_poses, heldout_seed
 from avp_habitat.images import write_rgb
+from avp_habitat.rollout_visibility import visibility_of
 from avp_habitat.rollout_writer import RolloutWriter
 from avp_habitat.settings import ACTION_NAMES
 from avp_habitat.versions import installed_versions
@@ -67,8 +68,8 @@ def publish_rollout(
     seed: int | None,
     heldout: int,
     mlflow_run_id: str | None = None,
-) -> None:
-    """Draw the trajectory and publish the folder.
+) -> dict[str, Any]:
+    """Draw the trajectory, measure what was seen, and publish the folder.
 
     Args:
         env: the environment, not wrapped.
@@ -78,10 +79,24 @@ def publish_rollout(
         seed: of the episode's start; None when it was not seeded itself.
         heldout: number of held-out views written.
         mlflow_run_id: of the training that the policy comes from.
+
+    Returns:
+        The metrics of `rollout.json`, those of the episode and `visibility` where held-out views show a surface.
     """
     write_rgb(writer.path("trajectory.png"), draw_trajectory(env.area, info["avp_trajectory"]))
-    about = {"policy": policy, "seed": seed, "metrics": info["avp_episode"], "mlflow_run_id": mlflow_run_id}
+    metrics = info["avp_episode"] | _visibility(writer)
+    about = {"policy": policy, "seed": seed, "metrics": metrics, "mlflow_run_id": mlflow_run_id}
     writer.publish(_scene_and_task(env, heldout) | about)
+    return metrics
+
+
+def _visibility(writer: RolloutWriter) -> dict[str, float]:
+    """From the files, in whole millimetres, so that the figure is the one that a reader of the folder computes."""
+    heldout = writer.views(heldout=True)
+    if not heldout:
+        return {}
+    found = visibility_of(writer.views(heldout=False), heldout, writer.intrinsics).figures()
+    return {name: value for name, value in found.items() if name == "visibility"}
 
 
 def _step_row(env: AVPEnv, action: int, reward: float, info: dict[str, Any]) -> dict[str, Any]:

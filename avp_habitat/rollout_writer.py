@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from avp_habitat import images
 from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.poses import Intrinsics
-from avp_habitat.rollout import FORMAT, FORMAT_VERSION, HELDOUT, POSE_CONVENTION, frame_name
+from avp_habitat.rollout import FORMAT, FORMAT_VERSION, HELDOUT, POSE_CONVENTION, View, frame_name
 
 
 class RolloutWriter:
@@ -38,7 +38,7 @@ class RolloutWriter:
         self.folder = Path(folder)
         self.intrinsics = intrinsics
         self._temporary = self.folder.parent / f".{self.folder.name}.partial-{os.getpid()}"
-        self._poses: dict[str, list[NDArray[np.floating]]] = {"": [], HELDOUT: []}
+        self._poses: dict[str, list[NDArray[np.float64]]] = {"": [], HELDOUT: []}
         self._steps: list[dict[str, Any]] = []
         if self.folder.exists() or self.folder.is_symlink():
             raise UsageError(f"--out {self.folder}: exists already; choose another name or remove it")
@@ -74,6 +74,13 @@ class RolloutWriter:
     def add_step(self, row: Mapping[str, Any]) -> None:
         """Remember the next row of `steps.csv`; all rows have the same keys."""
         self._steps.append(dict(row))
+
+    def views(self, *, heldout: bool) -> list[View]:
+        """The captured frames, or the held-out views, that were written so far."""
+        base = HELDOUT if heldout else ""
+        images, depths = self._temporary / base / "images", self._temporary / base / "depth"
+        names = [f"{frame_name(index)}.png" for index in range(len(self._poses[base]))]
+        return [View(images / n, depths / n, pose) for n, pose in zip(names, self._poses[base], strict=True)]
 
     def path(self, name: str) -> Path:
         """Where to write a further file of the folder."""

@@ -12,7 +12,18 @@ MAY_IMPORT = {
     "avp_sb3": {"avp_sb3", "avp_habitat"},
     "avp_nerfstudio": {"avp_nerfstudio", "avp_habitat"},
 }
-LIGHT = ("poses", "coverage", "metrics", "rewards", "rollout", "png", "observation", "trajectory", "errors")
+LIGHT = (
+    "poses",
+    "coverage",
+    "visibility",
+    "metrics",
+    "rewards",
+    "rollout",
+    "png",
+    "observation",
+    "trajectory",
+    "errors",
+)
 ONE_FILE = {"habitat_sim": "simulators/habitat/engine.py", "open3d": "simulators/raycast.py"}
 NOT_AT_IMPORT = ("torch", "open3d", "habitat_sim", "mlflow", "rerun", "numba", "stable_baselines3", "trimesh", "scipy")
 

@@ -1,0 +1,143 @@
+"""`python -m avp_habitat.seen`: how much of what a rollout's held-out views show its captured frames have seen."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from avp_habitat import command
+from avp_habitat.errors import RolloutError, UsageError
+from avp_habitat.rollout import read_rollout
+from avp_habitat.rollout_visibility import visibility_of
+from avp_habitat.visibility import ALIKE_DEG, ALIKE_DISTANCE, PARALLAX_DEG, Visibility
+
+_COLUMNS = {
+    "rollout": "rollout",
+    "scene": "scene",
+    "policy": "policy",
+    "views": "views",
+    "coverage": "coverage",
+    "visibility": "visibility",
+    "visibility_2_frames": "2 frames",
+    "visibility_3_frames": "3 frames",
+    "visibility_alike": "alike",
+    "visibility_parallax": "parallax",
+    "visibility_weighted": "weighted",
+}
+_WORDS = 3
+_MEANING = (
+    "visibility: share of the held-out pixels whose surface a captured frame has seen, in percent; 2 frames, 3 frames: "
+    f"by so many; alike: within {ALIKE_DEG:g} degrees of the held-out ray and at most {ALIKE_DISTANCE:g} times as far; "
+    f"parallax: along two rays {PARALLAX_DEG:g} degrees apart; weighted: by the best ray's likeness to the held-out one"
+)
+
+
+@dataclass(frozen=True)
+class Report:
+    """What was found of one rollout."""
+
+    about: dict[str, Any]
+    """Folder, scene, policy, views; coverage as the rollout says it, None where it does not."""
+    found: Visibility
+    """Of its held-out pixels."""
+
+    def as_json(self) -> dict[str, Any]:
+        """For programs: shares within [0, 1], also per held-out view and after each frame."""
+        per_view = [None if share != share else share for share in self.found.per_view().tolist()]
+        curve = self.found.curve().tolist()
+        return (
+            self.about | self.found.figures() | {"pixels": len(self.found.view), "per_view": per_view, "curve": curve}
+        )
+
+    def as_row(self) -> list[str]:
+        """For people: shares in percent."""
+        values = self.about | self.found.figures()
+        words = [str(values[name]) for name in list(_COLUMNS)[: _WORDS + 1]]
+        shares = [values[name] for name in list(_COLUMNS)[_WORDS + 1 :]]
+        return words + ["" if share is None else f"{100 * share:.1f}" for share in shares]
+
+
+def report_on(folder: Path, *, stride: int | None = None) -> Report:
+    """Read a rollout and measure what its frames have seen of its held-out views.
+
+    Args:
+        folder: of the rollout.
+        stride: as `rollout_visibility.visibility_of` takes it.
+
+    Raises:
+        RolloutError: the rollout is damaged, or no held-out view shows a surface.
+    """
+    rollout = read_rollout(folder)
+    scene, policy, metrics = (
+        part if isinstance(part, dict) else {} for part in map(rollout.meta.get, ("scene", "policy", "metrics"))
+    )
+    found = visibility_of(rollout.frames, rollout.heldout, rollout.intrinsics, stride=stride)
+    if not len(found.view):
+        raise RolloutError(
+            f"{folder}: expected held-out views that show a surface, found {len(rollout.heldout)} held-out views "
+            "without any depth; collect it with held-out views"
+        )
+    coverage = metrics.get("coverage")
+    about = {
+        "rollout": str(folder),
+        "scene": scene.get("name", ""),
+        "policy": policy.get("name", ""),
+        "views": len(rollout.frames),
+        "coverage": float(coverage) if isinstance(coverage, int | float) else None,
+    }
+    return Report(about, found)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m avp_habitat.seen",
+        description="How much of what the held-out views show the captured frames have seen: from depth alone, a "
+        "predictor of the reconstruction's quality.",
+        epilog=_MEANING,
+    )
+    add = parser.add_argument
+    add("rollouts", nargs="+", type=Path, metavar="ROLLOUT", help="rollout folders")
+    add(
+        "--every",
+        type=int,
+        metavar="N",
+        help="test every N-th row and column of the held-out views; 1 tests all pixels, in about a minute "
+        "(default: about 1,200 pixels of each view)",
+    )
+    add("--json", action="store_true", help="print JSON, with the shares per held-out view and after each frame")
+    return parser
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    rows = [list(_COLUMNS.values()), *rows]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    cells = [
+        [text.ljust(width) if column < _WORDS else text.rjust(width) for column, (text, width) in enumerate(pairs)]
+        for pairs in (zip(row, widths, strict=True) for row in rows)
+    ]
+    return "\n".join("  ".join(row).rstrip() for row in cells)
+
+
+def main(argv: Sequence[str]) -> None:
+    """Print a line for each rollout."""
+    options = _parser().parse_args(argv)
+    if options.every is not None and options.every < 1:
+        raise UsageError(f"--every: expected a whole number from 1, got {options.every}")
+    waiting = tqdm(
+        options.rollouts, desc="rollouts", unit="rollout", disable=True if len(options.rollouts) < 2 else None
+    )
+    reports = [report_on(folder, stride=options.every) for folder in waiting]
+    if options.json:
+        print(json.dumps([report.as_json() for report in reports], indent=2, allow_nan=False))
+        return
+    print(_table([report.as_row() for report in reports]))
+    print(f"\n{_MEANING}")
+
+
+if __name__ == "__main__":
+    sys.exit(command.run(main))
