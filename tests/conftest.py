@@ -37,4 +37,4 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     except SimulatorError as error:
         for item in items:
             if item.get_closest_marker("habitat"):
-                item.add_marker(pytest.mark.skip(reason=str(error)))
+                item.add_marker(pytest.mark.skip(reason=str(error).split(";")[0]))
