@@ -321,8 +321,9 @@ def test_runs_of_others_in_this_program_know_versions_and_open_scenes(client):
     with mlflow.start_run() as run:
         pass
     tags = client.get_run(run.info.run_id).data.tags
-    assert tags["avp.scene"] == "builtin:0"
-    assert tags["avp.scene_digest"] == env.scene_digest
+    # Other tests of this process may have left scenes open.
+    digests = dict(zip(tags["avp.scene"].split(", "), tags["avp.scene_digest"].split(", "), strict=True))
+    assert digests["builtin:0"] == env.scene_digest
     assert tags["version.stable-baselines3"]
     assert tags["system.platform"]
 
