@@ -8,9 +8,12 @@ from importlib import metadata
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
     """Version by name, of `python` first and then of those of the packages that are installed."""
     found = {"python": platform.python_version()}
-    for package in packages:
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
+    return found | {package: version for package in packages if (version := version_of(package)) is not None}
+
+
+def version_of(distribution: str) -> str | None:
+    """Installed version of a distribution; None when it is not installed."""
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None

@@ -66,11 +66,3 @@ def requirements() -> dict[str | None, list[Requirement]] | None:
             if marker.evaluate({"extra": extra}):
                 asked[extra].append(requirement)
     return asked
-
-
-def version_of(distribution: str) -> str | None:
-    """Installed version of a distribution; None when it is not installed."""
-    try:
-        return metadata.version(distribution)
-    except metadata.PackageNotFoundError:
-        return None

@@ -8,7 +8,8 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from avp_habitat.doctor.finding import ABSENT, BROKEN, OK, Finding
-from avp_habitat.doctor.manifest import DISTRIBUTION, requirements, version_of
+from avp_habitat.doctor.manifest import DISTRIBUTION, requirements
+from avp_habitat.versions import version_of
 
 _INSTALL = "pip install -e . in the checkout"
 

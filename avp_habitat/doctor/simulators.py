@@ -5,10 +5,10 @@ from pathlib import Path
 
 from avp_habitat.doctor.asking import ask
 from avp_habitat.doctor.finding import ABSENT, BROKEN, OK, Finding
-from avp_habitat.doctor.manifest import version_of
 from avp_habitat.errors import SimulatorError
 from avp_habitat.simulators.habitat.graphics import FIRST_DEVICE, choose_gpu, inspect_graphics
 from avp_habitat.simulators.habitat.installed import inspect_installation, require_installed
+from avp_habitat.versions import version_of
 
 LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"
 _OPEN_LIMIT_S = 120.0

@@ -7,10 +7,10 @@ import re
 import sys
 import sysconfig
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 
 from avp_habitat.errors import SimulatorError
+from avp_habitat.versions import version_of
 
 HOW_TO_GET = (
     "habitat-sim is not installed, and the package index has none; with Python 3.11 or 3.12 in a conda environment: "
@@ -103,7 +103,7 @@ def cannot_load(error: ImportError) -> str:
     if library:
         return f"habitat-sim is installed but cannot run here: {_missing_libraries([library[1]], present=False)}"
     if re.search(r"NumPy 1|numpy\.core\.multiarray|_ARRAY_API|numpy\.\w+ size changed", text):
-        found = _installed_version("numpy") or "none"
+        found = version_of("numpy") or "none"
         return f"habitat-sim or one of its packages was built for another NumPy than the {found} here: {text}"
     if re.search(r"(GLIBCXX|CXXABI|GLIBC)_[\d.]+' not found", text):
         return (
@@ -137,7 +137,7 @@ def _package_folder() -> Path | None:
 
 
 def _version(folder: Path) -> str | None:
-    found = _conda_version(folder) or _installed_version("habitat-sim")
+    found = _conda_version(folder) or version_of("habitat-sim")
     if found is None:
         written = re.search(r'__version__ = "([^"]+)"', (folder / "__init__.py").read_text(encoding="utf-8"))
         found = written[1] if written else None
@@ -153,13 +153,6 @@ def _conda_version(folder: Path) -> str | None:
             if folder.is_relative_to(prefix):
                 return record.name.split("-")[2]
     return None
-
-
-def _installed_version(distribution: str) -> str | None:
-    try:
-        return metadata.version(distribution)
-    except metadata.PackageNotFoundError:
-        return None
 
 
 def _numbers(version: str) -> tuple[int, ...]:
@@ -193,7 +186,7 @@ def _too_old(version: str | None) -> str | None:
 
 
 def _wrong_numpy(version: str | None) -> str | None:
-    numpy = _installed_version("numpy")
+    numpy = version_of("numpy")
     if version is None or numpy is None or _numbers(version) >= _FIRST_FOR_NUMPY_2 or _numbers(numpy) < (2,):
         return None
     return (
