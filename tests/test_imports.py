@@ -7,6 +7,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 SUITE = ("avp_habitat", "avp_sb3", "avp_nerfstudio")
+PROGRAMS = ("experiment", "benchmarks", "scripts", "examples")
+"""Beside the packages in a checkout, and not installed: they use the packages, never the other way round."""
 MAY_IMPORT = {
     "avp_habitat": {"avp_habitat"},
     "avp_sb3": {"avp_sb3", "avp_habitat"},
@@ -42,12 +44,13 @@ def imported(source, *, top_level_only=False):
 
 
 def wrong_directions(package, sources):
-    """`(file, module)` of every import of another package of the suite that may not be imported from here."""
+    """`(file, module)` of every import of what stands in a checkout and may not be imported from this package."""
+    forbidden = {*SUITE, *PROGRAMS} - MAY_IMPORT[package]
     return [
         (name, module)
         for name, source in sources.items()
         for module in sorted(imported(source))
-        if module.split(".")[0] in SUITE and module.split(".")[0] not in MAY_IMPORT[package]
+        if module.split(".")[0] in forbidden
     ]
 
 
@@ -70,6 +73,7 @@ def test_imports_between_the_packages_point_one_way(package):
         ("avp_habitat", "def late():\n    from avp_nerfstudio.dataparser import AVPDataParser"),
         ("avp_sb3", "from avp_nerfstudio import scores"),
         ("avp_nerfstudio", "import avp_sb3.vec_env as vec"),
+        *((package, f"from {program} import run") for package in SUITE for program in PROGRAMS),
     ],
 )
 def test_a_wrong_import_would_be_found(package, line):
