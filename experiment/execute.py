@@ -1,0 +1,124 @@
+"""One cell's command in a process of its own, forked from one that has imported everything already.
+
+Importing torch, nerfstudio and Stable-Baselines3 takes 10 to 20 seconds of a core, which hundreds of cells would pay.
+multiprocessing's forkserver pays it once; the commands still run apart from each other, each with a log file.
+"""
+
+import ctypes
+import importlib
+import os
+import runpy
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from avp_habitat import command
+from avp_habitat.errors import AVPError
+from avp_habitat.provenance import git_commit
+from experiment.cells import Cell
+from experiment.facts import facts_of
+from experiment.store import Store
+
+NO_FACTS = 3
+"""Exit code of a cell whose command succeeded, but whose result cannot be read."""
+_PR_SET_PDEATHSIG = 1
+_MLFLOW_OURS = ("MLFLOW_RUN_ID", "MLFLOW_EXPERIMENT_ID", "MLFLOW_EXPERIMENT_NAME")
+
+
+@dataclass(frozen=True)
+class Order:
+    """What a process is to do."""
+
+    cell: Cell
+    words: tuple[str, ...]
+    """The command line: `python -m MODULE …` or `python FILE …`."""
+    root: Path
+    """The experiment's folder."""
+    environment: dict[str, str]
+    """Variables."""
+
+
+def environment(tracking_uri: str) -> dict[str, str]:
+    """Variables of the cells: this process's, one thread each, and not MLflow's run, which is the experiment's own."""
+    kept = {name: value for name, value in os.environ.items() if name not in _MLFLOW_OURS}
+    return kept | {"OMP_NUM_THREADS": "1", "MLFLOW_TRACKING_URI": tracking_uri, "PYTHONWARNINGS": "ignore"}
+
+
+def execute(order: Order) -> None:
+    """Run a cell's command in this process, note what came of it, and end the process with the command's exit code."""
+    _die_with_parent()
+    os.environ.clear()
+    os.environ.update(order.environment)
+    store = Store(order.root)
+    with store.log(order.cell).open("a", encoding="utf-8") as log:
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        os.dup2(log.fileno(), 1)
+        os.dup2(log.fileno(), 2)
+        started = time.monotonic()
+        print(f"$ {order.cell.command}", flush=True)
+        code = _run(order.words)
+        if code == 0:
+            code = _finish(store, order.cell, time.monotonic() - started)
+        sys.stdout.flush()
+        sys.stderr.flush()
+    sys.exit(code)
+
+
+def _finish(store: Store, cell: Cell, seconds: float) -> int:
+    try:
+        facts = facts_of(cell, store.root)
+    except (AVPError, OSError, ValueError, KeyError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return NO_FACTS
+    finished = datetime.now(UTC).isoformat(timespec="seconds")
+    store.finish(cell, {"seconds": round(seconds, 1), "commit": git_commit(), "finished": finished, "facts": facts})
+    return 0
+
+
+def _run(words: Sequence[str]) -> int:
+    """The exit code of a command line; its program runs in this process."""
+    try:
+        sys.argv, main = list(words[1:]), _main_of(words)
+        return command.run(main, _arguments(words))
+    except SystemExit as end:
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:
+        traceback.print_exc()
+        return 1
+
+
+def _main_of(words: Sequence[str]) -> Callable[[Sequence[str]], None]:
+    if words[1] == "-m":
+        name = words[2]
+        return importlib.import_module(name).main
+    sys.path.insert(0, str(Path(words[1]).parent))
+    return runpy.run_path(words[1])["main"]
+
+
+def _arguments(words: Sequence[str]) -> list[str]:
+    return list(words[3:] if words[1] == "-m" else words[2:])
+
+
+def _die_with_parent() -> None:
+    """Ask the kernel to end this process when the one that forked it ends, also by SIGKILL."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def last_words(log: Path, lines: int = 3) -> str:
+    """The last lines of a log that say something, as one."""
+    try:
+        text = log.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return "no log"
+    said = [line.strip() for line in text.replace("\r", "\n").splitlines() if line.strip()]
+    errors = [line for line in said if line.startswith("error: ")]
+    return errors[-1].removeprefix("error: ") if errors else " | ".join(said[-lines:])[-400:]

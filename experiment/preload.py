@@ -1,0 +1,11 @@
+"""What the process from which cells are forked imports: everything heavy that their commands use."""
+
+import contextlib
+import importlib
+
+MODULES = ("avp_sb3", "avp_nerfstudio.reconstruct_imports", "avp_habitat.collect", "experiment.execute")
+"""An extra that is not installed is missed by the commands that need it, in words of theirs."""
+
+for module in MODULES:
+    with contextlib.suppress(ImportError):
+        importlib.import_module(module)
