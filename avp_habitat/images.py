@@ -25,6 +25,17 @@ def write_depth(path: Path, depth: NDArray[np.floating]) -> None:
     Image.fromarray(encode_depth(depth)).save(path, format="PNG", compress_level=4)
 
 
+def write_numbers(path: Path, numbers: NDArray[np.uint16]) -> None:
+    """Write `(height, width)` whole numbers as 16-bit grey PNG."""
+    Image.fromarray(numbers.astype(np.uint16)).save(path, format="PNG", compress_level=9)
+
+
+def read_numbers(path: Path) -> NDArray[np.uint16]:
+    """Read a 16-bit grey PNG as `(height, width)` whole numbers."""
+    with Image.open(path) as image:
+        return np.asarray(image).astype(np.uint16)
+
+
 def read_rgb(path: Path) -> NDArray[np.uint8]:
     """Read a PNG as `(height, width, 3)` uint8."""
     with Image.open(path) as image:

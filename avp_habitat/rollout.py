@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.errors import RolloutError
-from avp_habitat.png import GREY_16, RGB_8, check_png_structure
+from avp_habitat.png import GREY_16, RGB_8, check_png_contents, check_png_structure
 from avp_habitat.poses import Intrinsics, rigidity_fault
 
 FORMAT = "avp-rollout"
@@ -29,7 +29,8 @@ HELDOUT = "heldout"
 _CLEARLY_RIGID = 5e-5
 # Of 16 numbers, written with all their digits; a pose file longer than this is none.
 _LONGEST_POSE_BYTES = 4096
-_MANY_PIXELS = 1e9
+# Beyond any size in pixels or metres.
+_BEYOND_ANY_SIZE = 1e9
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,20 @@ class View:
     """16-bit PNG, planar depth in millimetres, 0 = none."""
     camera_to_world: NDArray[np.float64]
     """`(4, 4)`, habitat axes, metres."""
+
+
+@dataclass(frozen=True)
+class Floor:
+    """The floor seen from above: which cells are navigable, and when each was first observed; the file exists."""
+
+    picture: Path
+    """16-bit grey PNG, rows along +Z, columns along +X: 0 not navigable, 1 never observed, 1 + t first by view t."""
+    cell_m: float
+    """Side of a cell in metres."""
+    origin_m: tuple[float, float]
+    """x and z of the least corner of cell (0, 0), metres."""
+    shape: tuple[int, int]
+    """Rows and columns."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +73,8 @@ class Rollout:
     """The captured frames in the order of the steps."""
     heldout: list[View]
     """The held-out views."""
+    floor: Floor | None = None
+    """Its floor cells; None in rollouts that were written before there were any."""
 
 
 def frame_name(index: int) -> str:
@@ -84,7 +101,7 @@ def read_rollout(folder: str | Path) -> Rollout:
     intrinsics = _intrinsics(folder / "rollout.json", meta)
     frames = _read_views(folder, folder, _count(folder, meta, "frames"), intrinsics)
     heldout = _read_views(folder, folder / HELDOUT, _count(folder, meta, HELDOUT), intrinsics)
-    return Rollout(folder, meta, intrinsics, frames, heldout)
+    return Rollout(folder, meta, intrinsics, frames, heldout, _read_floor(folder, meta))
 
 
 def read_meta(folder: Path) -> dict[str, Any]:
@@ -195,7 +212,7 @@ def _intrinsics(path: Path, meta: dict[str, Any]) -> Intrinsics:
 
 
 def _is_number_of_pixels(value: Any) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < _MANY_PIXELS
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < _BEYOND_ANY_SIZE
 
 
 def _read_views(root: Path, base: Path, count: int, intrinsics: Intrinsics) -> list[View]:
@@ -211,6 +228,34 @@ def _read_views(root: Path, base: Path, count: int, intrinsics: Intrinsics) -> l
         check_png_structure(f"{base}/depth/{stem}.png", **size, kind=GREY_16)
     images, depths = base / "images", base / "depth"
     return [View(images / f"{stem}.png", depths / f"{stem}.png", pose) for stem, pose in zip(stems, poses, strict=True)]
+
+
+def _read_floor(folder: Path, meta: dict[str, Any]) -> Floor | None:
+    if "floor" not in meta:
+        return None
+    entry, about = _of(meta, "floor"), folder / "rollout.json"
+    name, shape, origin, cell = (entry.get(key) for key in ("file", "shape", "origin_m", "cell_m"))
+    if not isinstance(name, str) or not name:
+        raise RolloutError(f"{about}: expected floor.file to be the name of a file, found {name!r}")
+    if not _is_pair(shape) or not all(isinstance(side, int) and _is_number_of_pixels(side) for side in shape):
+        raise RolloutError(f"{about}: expected floor.shape to be rows and columns above 0, found {shape!r}")
+    if not _is_pair(origin) or not all(map(_is_finite, origin)):
+        raise RolloutError(f"{about}: expected floor.origin_m to be x and z in metres, found {origin!r}")
+    if not _is_finite(cell) or cell <= 0:
+        raise RolloutError(f"{about}: expected floor.cell_m to be metres above 0, found {cell!r}")
+    picture = folder / name
+    _check_inside(folder, picture)
+    check_png_structure(str(picture), width=shape[1], height=shape[0], kind=GREY_16)
+    check_png_contents(picture)
+    return Floor(picture, float(cell), (float(origin[0]), float(origin[1])), (shape[0], shape[1]))
+
+
+def _is_pair(value: Any) -> TypeGuard[list[Any]]:
+    return isinstance(value, list) and len(value) == 2
+
+
+def _is_finite(value: Any) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(abs(value) < _BEYOND_ANY_SIZE)
 
 
 def _check_listing(root: Path, folder: Path, suffix: str, count: int) -> None:

@@ -10,14 +10,17 @@ import numpy as np
 from avp_habitat.drawing import draw_trajectory
 from avp_habitat.env import AVPEnv
 from avp_habitat.heldout import heldout_poses, heldout_seed
-from avp_habitat.images import write_rgb
+from avp_habitat.images import write_numbers, write_rgb
+from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.rollout_visibility import visibility_of
 from avp_habitat.rollout_writer import RolloutWriter
 from avp_habitat.settings import ACTION_NAMES
+from avp_habitat.trajectory import Trajectory
 from avp_habitat.versions import installed_versions
 
 _VERSIONED = ("avp-suite", "numpy", "gymnasium", "open3d", "pillow", "stable-baselines3", "torch")
 _HELDOUT_BATCH = 4
+_FLOOR_FILE = "floor.png"
 
 
 def capture_step(env: AVPEnv, writer: RolloutWriter, action: int, reward: float, info: dict[str, Any]) -> None:
@@ -69,7 +72,7 @@ def publish_rollout(
     heldout: int,
     mlflow_run_id: str | None = None,
 ) -> dict[str, Any]:
-    """Draw the trajectory, measure what was seen, and publish the folder.
+    """Draw the trajectory and the floor, measure what was seen, and publish the folder.
 
     Args:
         env: the environment, not wrapped.
@@ -84,10 +87,24 @@ def publish_rollout(
         The metrics of `rollout.json`, those of the episode and `visibility` where held-out views show a surface.
     """
     write_rgb(writer.path("trajectory.png"), draw_trajectory(env.area, info["avp_trajectory"]))
+    floor = _write_floor(env.area, info["avp_trajectory"], writer)
     metrics = info["avp_episode"] | _visibility(writer)
-    about = {"policy": policy, "seed": seed, "metrics": metrics, "mlflow_run_id": mlflow_run_id}
+    about = {"policy": policy, "seed": seed, "metrics": metrics, "floor": floor, "mlflow_run_id": mlflow_run_id}
     writer.publish(_scene_and_task(env, heldout) | about)
     return metrics
+
+
+def _write_floor(area: NavigableArea, trajectory: Trajectory, writer: RolloutWriter) -> dict[str, Any]:
+    """`rollout.json`'s entry; the picture holds 0 not navigable, 1 never observed, 1 + t first observed by view t."""
+    numbers = np.zeros(area.mask.shape, dtype=np.uint16)
+    numbers[area.mask] = 1 + trajectory.first_seen
+    write_numbers(writer.path(_FLOOR_FILE), numbers)
+    return {
+        "file": _FLOOR_FILE,
+        "cell_m": area.cell_m,
+        "origin_m": [float(value) for value in area.origin],
+        "shape": list(area.mask.shape),
+    }
 
 
 def _visibility(writer: RolloutWriter) -> dict[str, float]:

@@ -59,7 +59,8 @@ def test_the_folder_holds_what_the_design_says(rollout):
     assert (len(found.frames), len(found.heldout)) == (6, 20)
     names = {path.name for path in rollout.iterdir()}
     assert names == {
-        "rollout.json", "transforms.json", "images", "depth", "poses", "steps.csv", "heldout", "trajectory.png"
+        "rollout.json", "transforms.json", "images", "depth", "poses", "steps.csv", "heldout", "trajectory.png",
+        "floor.png",
     }  # fmt: skip
     meta = found.meta
     assert meta["scene"]["name"] == "builtin:0"

@@ -3,17 +3,21 @@ import shutil
 
 import numpy as np
 import pytest
+from corridor import Corridor
 from PIL import Image
 
 from avp_habitat import images, poses
+from avp_habitat.env import AVPEnv
 from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.png import check_png_contents
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout import read_rollout
+from avp_habitat.rollout_capture import capture_step, publish_rollout
 from avp_habitat.rollout_writer import RolloutWriter
 
 CAMERA = Intrinsics.from_hfov(12, 8, hfov_deg=75)
 FRAMES, HELDOUT = 3, 2
+FLOOR = np.array([[0, 1, 2, 4], [1, 2, 3, 0], [0, 0, 1, 70]], dtype=np.uint16)
 
 
 def some_poses(count):
@@ -30,7 +34,10 @@ def write(folder):
             writer.add_step({"step": k + 1, "action": "stop"})
         for pose in some_poses(HELDOUT):
             writer.add_heldout(rng.integers(0, 255, (8, 12, 3), dtype=np.uint8), rng.uniform(0.5, 9, (8, 12)), pose)
-        writer.publish({"seed": 3, "versions": {"avp-suite": "0.1.0"}, "camera": {"hfov_deg": 75}})
+        images.write_numbers(writer.path("floor.png"), FLOOR)
+        floor = {"file": "floor.png", "cell_m": 0.1, "origin_m": [-1.5, 2.25], "shape": list(FLOOR.shape)}
+        about = {"seed": 3, "versions": {"avp-suite": "0.1.0"}, "camera": {"hfov_deg": 75}}
+        writer.publish(about | {"floor": floor})
     return folder
 
 
@@ -120,6 +127,43 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_floor_reads_back_as_it_was_written(rollout):
+    floor = read_rollout(rollout).floor
+    assert floor is not None
+    assert (floor.cell_m, floor.origin_m, floor.shape) == (0.1, (-1.5, 2.25), (3, 4))
+    np.testing.assert_array_equal(images.read_numbers(floor.picture), FLOOR)
+
+
+def test_a_rollout_of_before_has_no_floor(rollout):
+    edit_json(rollout / "rollout.json", lambda j: j.pop("floor"))
+    (rollout / "floor.png").unlink()
+    found = read_rollout(rollout)
+    assert found.floor is None
+    assert len(found.frames) == FRAMES
+
+
+def test_the_floor_counts_what_the_environment_observed(tmp_path):
+    """Cells by the view that first observed them give the coverage after every view."""
+    env = AVPEnv(simulator=Corridor(), budget=4, width=16, height=12)
+    env.reset(seed=0)
+    curve = []
+    with RolloutWriter(tmp_path / "r", CAMERA) as writer:
+        for action in (0, 1, 1, 0):
+            _, reward, _, _, info = env.step(action)
+            capture_step(env, writer, action, reward, info)
+            curve.append(info["coverage"])
+        publish_rollout(env, writer, info, policy={"name": "a list"}, seed=0, heldout=0)
+    floor = read_rollout(tmp_path / "r").floor
+    assert floor is not None
+    numbers = images.read_numbers(floor.picture)
+    np.testing.assert_array_equal(numbers > 0, env.area.mask)
+    found = [((numbers > 1) & (numbers <= 1 + t)).sum() / (numbers > 0).sum() for t in range(1, 5)]
+    assert curve[0] < curve[-1]
+    np.testing.assert_allclose(found, curve)
+    assert floor.cell_m == env.area.cell_m
+    np.testing.assert_allclose(floor.origin_m, env.area.origin)
+
+
 def edit_json(path, change):
     value = json.loads(path.read_text())
     change(value)
@@ -145,6 +189,12 @@ def link_out(folder, name):
 def cut_short(folder, name):
     path = folder / name
     path.write_bytes(path.read_bytes()[:-20])
+
+
+def flip_byte(path, position):
+    content = bytearray(path.read_bytes())
+    content[position] ^= 1
+    path.write_bytes(content)
 
 
 def link_to_itself(folder, name):
@@ -225,6 +275,35 @@ DAMAGES = {
     "image leads to itself": (lambda f: link_to_itself(f, "images/frame_00001.png"), "link that leads to itself"),
     "image outside": (lambda f: link_out(f, "images/frame_00001.png"), "expected a path inside"),
     "pose outside": (lambda f: link_out(f, "poses/frame_00000.txt"), "expected a path inside"),
+    "no floor": (lambda f: (f / "floor.png").unlink(), "floor.png: expected a 16-bit grey PNG, could not read it"),
+    "floor is text": (
+        lambda f: edit_json(f / "rollout.json", lambda j: j.update(floor="floor.png")),
+        "floor.file to be the name of a file, found None",
+    ),
+    "floor outside": (lambda f: link_out(f, "floor.png"), "floor.png: expected a path inside"),
+    "floor elsewhere": (
+        lambda f: edit_json(f / "rollout.json", lambda j: j["floor"].update(file="../floor.png")),
+        r"\.\./floor.png: expected a path inside",
+    ),
+    "floor cut short": (lambda f: cut_short(f, "floor.png"), "floor.png: .* without an end"),
+    "floor damaged": (lambda f: flip_byte(f / "floor.png", 60), "floor.png: .* does not match its checksum"),
+    "floor of another size": (
+        lambda f: edit_json(f / "rollout.json", lambda j: j["floor"].update(shape=[4, 3])),
+        "floor.png: expected 3x4 pixels .*found 4x3",
+    ),
+    "8-bit floor": (lambda f: resize(f, "floor.png", (4, 3), "L"), "floor.png: expected a 16-bit grey PNG"),
+    "floor of no shape": (
+        lambda f: edit_json(f / "rollout.json", lambda j: j["floor"].update(shape=[3, 0])),
+        r"floor.shape to be rows and columns above 0, found \[3, 0\]",
+    ),
+    "floor nowhere": (
+        lambda f: edit_json(f / "rollout.json", lambda j: j["floor"].update(origin_m=[0, float("nan")])),
+        "floor.origin_m to be x and z in metres",
+    ),
+    "floor of no cells": (
+        lambda f: edit_json(f / "rollout.json", lambda j: j["floor"].update(cell_m=0)),
+        "floor.cell_m to be metres above 0, found 0",
+    ),
     "rollout.json outside": (lambda f: link_out(f, "rollout.json"), "expected a path inside"),
 }
 
