@@ -18,7 +18,7 @@ from experiment.cells import Cell, plan
 from experiment.configuration import Configuration, keep, read_scenes
 from experiment.methods import DEFAULT, METHODS, chosen_methods
 from experiment.presets import PRESETS, preset_named
-from experiment.runner import Runner, default_jobs
+from experiment.runner import PRELOAD, Runner, default_jobs
 from experiment.store import Store, bytes_needed
 
 AUTO = "auto"
@@ -124,8 +124,8 @@ def run(options: Options, line: str) -> None:
         status = "FAILED"
         try:
             cells = plan(options.configuration, options.out, tracking=parent.experiment)
-            fresh = options.configuration.simulator in ONE_PER_PROCESS
-            runner = Runner(store, options.jobs, environment(tracking_uri()), fresh)
+            preload = () if options.configuration.simulator in ONE_PER_PROCESS else PRELOAD
+            runner = Runner(store, options.jobs, environment(tracking_uri()), preload)
             runner.run(cells)
             write_report(options, store, cells, line, parent)
             status = "FINISHED"

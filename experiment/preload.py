@@ -2,10 +2,13 @@
 
 import contextlib
 import importlib
+import warnings
 
 MODULES = ("avp_sb3", "avp_nerfstudio.reconstruct_imports", "avp_habitat.collect", "experiment.execute")
 """An extra that is not installed is missed by the commands that need it, in words of theirs."""
 
+# Hosts warn about each other's versions, on which nobody can act here.
+warnings.simplefilter("ignore")
 for module in MODULES:
     with contextlib.suppress(ImportError):
         importlib.import_module(module)

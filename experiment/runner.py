@@ -16,6 +16,7 @@ from experiment.cells import COLLECT, RECONSTRUCT, TRAIN, Cell
 from experiment.execute import Order, execute, last_words
 from experiment.store import Store
 
+PRELOAD = ("experiment.preload",)
 _GUESS_S = {TRAIN: 120.0, COLLECT: 10.0, RECONSTRUCT: 30.0}
 _POLL_S = 1.0
 _PATIENCE_S = 30.0
@@ -39,8 +40,8 @@ class Runner:
     """Cells at a time."""
     environment: dict[str, str]
     """Of their processes."""
-    fresh: bool = False
-    """Whether each cell has a new process that has imported nothing, as Habitat-Sim wants it."""
+    preload: Sequence[str] = PRELOAD
+    """Modules imported once, before any cell; with none each cell has a new process, as Habitat-Sim wants it."""
     seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     """How long cells of each kind took."""
     failed: dict[str, str] = field(default_factory=dict)
@@ -56,9 +57,9 @@ class Runner:
             if (record := self.store.record(cell)) is not None:
                 self.seconds[cell.kind].append(record["seconds"])
         waiting = [cell for cell in cells if not self.store.is_done(cell)]
-        context = multiprocessing.get_context("spawn" if self.fresh else "forkserver")
-        if not self.fresh:
-            context.set_forkserver_preload(["experiment.preload"])
+        context = multiprocessing.get_context("forkserver" if self.preload else "spawn")
+        if self.preload:
+            context.set_forkserver_preload(list(self.preload))
         running: list[_Running] = []
         done = len(cells) - len(waiting)
         with tqdm(total=len(cells), initial=done, desc="experiment", unit="cell", bar_format=_BAR) as bar:

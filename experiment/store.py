@@ -84,7 +84,7 @@ class Store:
 def bytes_needed(cells: list[Cell], *, width: int, height: int, budget: int, heldout: int) -> int:
     """About how much disk cells take that are still to be done.
 
-    Measured: a picture with its depth takes up to 3.5 bytes per pixel, a kept reconstruction or training some megabytes.
+    Measured: a picture with its depth takes up to 3.5 bytes per pixel, a reconstruction or training some megabytes.
 
     Args:
         cells: still to be done.

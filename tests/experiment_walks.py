@@ -1,0 +1,32 @@
+"""A small real experiment of rollouts alone; run as a program it does what is left of it."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from experiment.cells import COLLECT, plan
+from experiment.configuration import Configuration, Scene
+from experiment.execute import environment
+from experiment.methods import chosen_methods
+from experiment.presets import PRESETS
+from experiment.runner import Runner
+from experiment.store import Store
+
+
+def rollouts(root):
+    preset = replace(PRESETS["smoke"], budget=3, size=(32, 24), starts=3, prefixes=())
+    scenes = (Scene("builtin:0", "builtin:0", "00", "train"),)
+    configuration = Configuration("smoke", preset, 1, scenes, chosen_methods(["heuristic", "random"]))
+    return [cell for cell in plan(configuration, root, tracking="avp") if cell.kind == COLLECT]
+
+
+def run(root, cells, jobs=1):
+    runner = Runner(Store(root), jobs, environment(f"sqlite:///{root}/mlflow.db"), ("experiment.execute",))
+    runner.run(cells)
+    return runner
+
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1])
+    print(json.dumps(run(folder, rollouts(folder)).failed))

@@ -1,0 +1,102 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import experiment_walks
+import pytest
+
+from avp_habitat.rollout import read_rollout
+from experiment.store import DONE, Store
+
+ROOT = Path(__file__).resolve().parent.parent
+PROGRAM = Path(experiment_walks.__file__)
+
+
+def start(folder):
+    """The small experiment as a process of its own, which leads a session, so that nothing else gets its signals."""
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    words = [sys.executable, str(PROGRAM), str(folder)]
+    return subprocess.Popen(words, cwd=ROOT, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                            start_new_session=True)  # fmt: skip
+
+
+def done(folder):
+    return sorted(folder.glob(f"cells/*/*/{DONE}"))
+
+
+def wait_for(condition, seconds=90):
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until, "waited too long"
+        time.sleep(0.05)
+
+
+def processes_of(session):
+    """Numbers of the processes of a session that still run."""
+    found = subprocess.run(["ps", "-o", "pid=,stat=", "--sid", str(session)], capture_output=True, text=True).stdout
+    return [line.split()[0] for line in found.splitlines() if not line.split()[1].startswith("Z")]
+
+
+def test_killed_half_way_it_goes_on_with_what_is_missing_and_repeats_nothing(tmp_path):
+    first = start(tmp_path)
+    wait_for(lambda: len(done(tmp_path)) >= 2)
+    os.kill(first.pid, signal.SIGKILL)
+    first.communicate()
+    # What the killed program had begun ends with it, or two programs would write one rollout.
+    wait_for(lambda: not processes_of(first.pid), 20)
+    before = {path: path.read_bytes() for path in done(tmp_path)}
+    assert 2 <= len(before) < 6
+    second = start(tmp_path)
+    failed, errors = second.communicate(timeout=120)
+    assert (second.returncode, json.loads(failed)) == (0, {}), errors
+    assert len(done(tmp_path)) == 6
+    assert {path: path.read_bytes() for path in before} == before
+    for cell in experiment_walks.rollouts(tmp_path):
+        assert len(read_rollout(cell.output(tmp_path)).frames) == 3
+        record = Store(tmp_path).record(cell)
+        assert len(record["facts"]["coverage_curve"]) == 3
+        assert record["facts"]["visibility_curve"][-1] == pytest.approx(
+            record["facts"]["metrics"]["visibility"], abs=1e-6
+        )
+
+
+def test_an_interruption_ends_what_is_running_and_keeps_what_is_done(tmp_path):
+    program = start(tmp_path)
+    wait_for(lambda: len(done(tmp_path)) >= 1)
+    os.killpg(program.pid, signal.SIGINT)
+    program.communicate(timeout=60)
+    assert program.returncode != 0
+    wait_for(lambda: not processes_of(program.pid), 20)
+    assert 1 <= len(done(tmp_path)) < 6
+    assert not list(tmp_path.glob("cells/*/*/failed.json"))
+
+
+def test_a_cell_that_fails_is_told_with_its_reason_and_the_others_are_done(tmp_path):
+    whole, other = experiment_walks.rollouts(tmp_path)[:2]
+    lost = replace(other, words=tuple(word.replace("builtin:0", "gone.glb") for word in other.words))
+    after = replace(other, name="after", needs=lost)
+    runner = experiment_walks.run(tmp_path, [lost, after, whole], jobs=2)
+    store = Store(tmp_path)
+    assert set(runner.failed) == {lost.key, after.key}
+    assert "gone.glb" in runner.failed[lost.key]
+    assert runner.failed[lost.key].startswith("exit code 1: ")
+    assert runner.failed[after.key] == f"needs {lost.key}, which failed"
+    assert "gone.glb" in store.failure(lost)
+    assert store.is_done(whole)
+    # Tried again, and better, it is not called failed any more.
+    assert experiment_walks.run(tmp_path, [other, whole]).failed == {}
+    assert store.is_done(other)
+    assert store.failure(other) is None
+
+
+def test_a_command_that_dies_is_told_by_its_signal(tmp_path):
+    cell = experiment_walks.rollouts(tmp_path)[0]
+    program = tmp_path / "dies.py"
+    program.write_text("import os, signal\ndef main(argv):\n    os.kill(os.getpid(), signal.SIGSEGV)\n")
+    runner = experiment_walks.run(tmp_path, [replace(cell, words=("python", str(program)))])
+    assert runner.failed[cell.key].startswith("killed by signal 11")
