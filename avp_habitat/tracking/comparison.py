@@ -40,6 +40,7 @@ _FIGURES = {
     _VIEWS: _Figure("views", 1, 1),
     _COVERAGE: _Figure("coverage [%]", 100, 1),
     "cpv": _Figure("CpV [%/view]", 1, 2),
+    "eval/visibility": _Figure("visibility [%]", 100, 1),
     _PSNR: _Figure("PSNR [dB]", 1, 2),
     "eval/ssim": _Figure("SSIM", 1, 3),
     "eval/lpips": _Figure("LPIPS", 1, 3),

@@ -20,7 +20,7 @@ VIEW_TAG = "mlflow.sharedViewState."
 NOTE_TAG = "mlflow.note.content"
 KIND_TAG = "mlflow.experimentKind"
 COLOUR_TAG = "mlflow.runColor"
-FIGURES = ("eval/psnr", "eval/views", "eval/coverage", "eval/ssim", "eval/lpips")
+FIGURES = ("eval/psnr", "eval/views", "eval/coverage", "eval/visibility", "eval/ssim", "eval/lpips")
 """What answers which policy gives the better reconstruction for fewer views."""
 
 _COLOURS = {
