@@ -4,6 +4,7 @@ import contextlib
 import io
 import math
 import random
+import shutil
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -97,6 +98,8 @@ def process(request: "Request", rollout: Rollout, folder: ReconstructionFolder, 
     }
     if request.keep_checkpoint:
         found["config"] = str(_keep(config, folder).relative_to(folder.path("").resolve()))
+    else:
+        shutil.rmtree(folder.path(_OUTPUTS))
     folder.write_scores(found)
     if request.mlflow:
         _track(request.mlflow, config, folder, found)
@@ -137,6 +140,8 @@ def _train(trainer: Any) -> None:
 def _score(pipeline: Any, folder: ReconstructionFolder, pictures: Sequence[int]) -> list[tuple[str, dict[str, float]]]:
     """Name and scores of each held-out view."""
     pipeline.eval()
+    # What ns-eval has after loading a checkpoint, which does not hold how far a short training has annealed.
+    pipeline.model.proposal_sampler.set_anneal(1.0)
     # The compiled encoding gives the same colours several times as fast; on other devices it changes nothing.
     compile_hash_encodings(pipeline.model)
     views = []
