@@ -121,7 +121,7 @@ class Runner:
         now = time.monotonic()
         left += sum(max(self._expected(one.cell) - (now - one.began), 0) for one in running)
         failures = f", {len(self.failed)} failed" if self.failed else ""
-        return f"about {_span(left / self.jobs)} left{failures}: {', '.join(one.cell.key for one in running)}"
+        return f"about {_span(left / self.jobs)} left{failures}; now {', '.join(one.cell.key for one in running)}"
 
     def _expected(self, cell: Cell) -> float:
         known = self.seconds[cell.kind]

@@ -393,6 +393,22 @@ def test_zero_displacement_changes_nothing():
     np.testing.assert_array_equal(plane().slide(points, np.zeros_like(points)), points)
 
 
+@pytest.mark.parametrize("length", [1e-3, 1e-9, 1e-15, 1e-30, 1e-160, 1e-170, 1e-300])
+def test_displacements_of_any_smallness_towards_a_corner_are_moves(length):
+    # Contacts in a corner leave 1e-17 of a displacement each time: after ten its square is 0, by which none may divide.
+    area = plane()
+    corner = np.array(PILLAR[0])
+    angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    around = corner + 0.001 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    begin = on_floor(*around)
+    begin = begin[area.contains(begin)]
+    towards = np.zeros_like(begin)
+    towards[:, [0, 2]] = length * (corner - begin[:, [0, 2]])
+    end = area.slide(begin, towards)
+    assert area.contains(end).all()
+    assert np.linalg.norm(end - begin, axis=1).max() <= length
+
+
 def test_agent_in_a_concave_corner_stays_and_can_leave():
     area = plane()
     corner = area.slide(on_floor((0.3, 0.4)), np.array([[-5.0, 0.0, -4.0]]))

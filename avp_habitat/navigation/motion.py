@@ -13,6 +13,8 @@ from avp_habitat.navigation.walls import SKIN_M, Walls, near_line
 
 _MOST_CONTACTS = 32
 _PARALLEL = 1e-12
+_STILL_M = 1e-12
+"""Less than this is no move. In a corner each contact leaves some 1e-17 of a displacement, whose square soon is 0."""
 
 
 def slide(walls: Walls, positions: NDArray[np.float64], displacements: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -39,6 +41,8 @@ def _slide_all(walls, positions, displacements):
         x, z = positions[i]
         dx, dz = displacements[i]
         for _ in range(_MOST_CONTACTS):
+            if abs(dx) + abs(dz) < _STILL_M:
+                break
             ticket += 1
             count = near_line(walls, x, z, x + dx, z + dz, seen, ticket, found)
             share, normal_x, normal_z = _first_contact(walls.ends, found[:count], x, z, dx, dz)
