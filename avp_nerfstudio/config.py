@@ -41,7 +41,7 @@ class Size:
 CPU = Size(
     iterations=6000,
     rays=1024,
-    rays_per_chunk=1 << 13,
+    rays_per_chunk=1 << 12,
     proposal_samples=64,
     samples=8,
     levels=10,

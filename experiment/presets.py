@@ -59,8 +59,8 @@ PRESETS = {
         rooms=16,
         size=(192, 144),
         reconstruction="avp-nerfacto",
-        iterations=400,
-        prefixes=(20, 40, 60),
+        iterations=300,
+        prefixes=(20, 40),
     ),
     "gpu": Preset(
         seeds=3,
