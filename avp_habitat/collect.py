@@ -60,7 +60,7 @@ def collect(request: Request) -> dict[str, Any]:
     """Collect one rollout.
 
     Returns:
-        The metrics written to `rollout.json`, which are those of `task.episode_metrics`, and visibility.
+        The metrics written to `rollout.json`, which are those of `trajectory.episode_metrics`, and visibility.
 
     Raises:
         UsageError: a name is unknown or the folder exists.

@@ -14,7 +14,8 @@ from avp_habitat.poses import Intrinsics
 from avp_habitat.settings import ACTION_NAMES, TaskSettings
 from avp_habitat.simulators import Frames, Simulator, SimulatorChoice, open_simulator
 from avp_habitat.spaces import action_space, observation_space
-from avp_habitat.task import StepOutcome, ViewpointTask, episode_metrics
+from avp_habitat.task import StepOutcome, ViewpointTask
+from avp_habitat.trajectory import episode_metrics
 
 RENDER_MODES = ("rgb_array",)
 _PICTURE = (480, 360)
@@ -24,9 +25,10 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
     """An agent that walks through a scene and decides which views to take.
 
     Observations are the twelve numbers of `observation.NAMES`, with `observation="map"` followed by a map of what was
-    seen; actions are the six of `settings.ACTION_NAMES`. `info` of every step holds `coverage`, `new_cells`, `views`,
-    `collided`, `redundant` and `reward_parts`; the last step of an episode adds `avp_episode` (figures, see
-    `task.episode_metrics`), `avp_trajectory` and `is_success`.
+    seen of the floor, with `"surface_map"` by those of walls, furniture and ceiling too; actions are the six of
+    `settings.ACTION_NAMES`. `info` of every step holds `coverage`, `new_cells`, `views`, `collided`, `redundant` and
+    `reward_parts`; the last step of an episode adds `avp_episode` (figures, see `trajectory.episode_metrics`),
+    `avp_trajectory` and `is_success`.
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 4}  # noqa: RUF012 - gymnasium's own declaration

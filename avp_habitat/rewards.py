@@ -1,4 +1,4 @@
-"""The three rewards of the task as sums of named parts, for n agents at a time."""
+"""The four rewards of the task as sums of named parts, for n agents at a time."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ Float = NDArray[np.floating]
 Number = NDArray[np.number]
 Bool = NDArray[np.bool_]
 
-PARTS = ("coverage", "spread", "step", "collision", "redundancy", "stop")
+PARTS = ("coverage", "surface", "spread", "step", "collision", "redundancy", "stop")
 """Names of the parts; every reward returns all of them, zero where it has no such term."""
 
 
@@ -24,8 +24,10 @@ class RewardConstants:
     """α of `coverage` and `coverage_redundancy`: reward per newly observed cell (0.01 m²)."""
     alpha_proposed: float = 0.0088
     """α of `proposed`: reward per (newly observed cell)^β."""
+    alpha_surface: float = 0.0045
+    """α of `surface`: reward per (newly seen surface point)^β, each weighted by how well it is seen (`surfaces`)."""
     beta: float = 0.9
-    """β of `proposed`, no unit, below 1: many new cells at once count less than the same cells one after another."""
+    """β of `proposed` and `surface`, no unit, below 1: much that is new at once counts less than step after step."""
     visit_decay: float = 0.5
     """Weight of earlier visits v in α / (1 + 0.5·v), per visit."""
     spread: float = 0.002
@@ -58,6 +60,8 @@ class StepFacts:
 
     new_cells: Number
     """Δc: navigable cells first observed by this step's view."""
+    new_surface: Number
+    """ΔS: by how much the qualities of the scene's surface points grew by this step's view; 0 where not computed."""
     earlier_visits: Number
     """v: earlier views taken from the agent's cell."""
     spread_m: Number
@@ -86,11 +90,28 @@ def _coverage_redundancy(facts: StepFacts, constants: RewardConstants) -> dict[s
 
 def _proposed(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """Eq. 19–22: sublinear, visit-discounted coverage with dispersion, step cost and a learned stop."""
-    discount = constants.alpha_proposed / (1 + constants.visit_decay * facts.earlier_visits)
+    return _with_ends(facts, constants) | {
+        "coverage": _new(facts.new_cells, constants.alpha_proposed, facts, constants)
+    }
+
+
+def _surface(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
+    """`proposed` with new surface ΔS in place of new cells Δc."""
+    return _with_ends(facts, constants) | {
+        "surface": _new(facts.new_surface, constants.alpha_surface, facts, constants)
+    }
+
+
+def _new(amount: Number, alpha: float, facts: StepFacts, constants: RewardConstants) -> Number:
+    """α / (1 + 0.5·v) · amount^β."""
+    return alpha / (1 + constants.visit_decay * facts.earlier_visits) * np.power(amount, constants.beta)
+
+
+def _with_ends(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
+    """What `proposed` and `surface` share: dispersion, costs and the stop."""
     success = constants.stop_bonus + constants.stop_per_step_left * facts.steps_left
     stop = np.where(stops_episode(facts, constants), success, -constants.early_stop)
     return _dispersion(facts, constants) | {
-        "coverage": discount * np.power(facts.new_cells, constants.beta),
         "step": np.full(len(facts.coverage), -constants.step),
         "collision": -constants.collision * facts.collided,
         "stop": np.where(facts.stop_chosen, stop, 0.0),
@@ -108,9 +129,10 @@ _REWARDS: dict[str, Callable[[StepFacts, RewardConstants], dict[str, Number]]] =
     "coverage": _coverage,
     "coverage_redundancy": _coverage_redundancy,
     "proposed": _proposed,
+    "surface": _surface,
 }
 REWARD_NAMES = tuple(_REWARDS)
-_WITH_STOP = frozenset({"proposed"})
+_WITH_STOP = frozenset({"proposed", "surface"})
 
 
 def check_reward(name: str) -> str:

@@ -10,7 +10,7 @@ from avp_habitat.rewards import RewardConstants, check_reward
 ACTION_NAMES = ("move_forward", "turn_left", "turn_right", "look_up", "look_down", "stop")
 MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, LOOK_UP, LOOK_DOWN, STOP = range(len(ACTION_NAMES))
 COVERAGE_MODES = ("visible", "over")
-OBSERVATION_NAMES = ("numbers", "map")
+OBSERVATION_NAMES = ("numbers", "map", "surface_map")
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class TaskSettings:
     """Everything about the task but the scene."""
 
     reward: str = "proposed"
-    """Name of the reward: coverage, coverage_redundancy or proposed."""
+    """Name of the reward: coverage, coverage_redundancy, proposed or surface."""
     constants: RewardConstants = field(default_factory=RewardConstants)
     """The rewards' constants."""
     budget: int = 80
@@ -47,8 +47,9 @@ class TaskSettings:
     """A hit this close before a floor point still observes it, metres along the ray."""
     coverage_mode: Literal["visible", "over"] = "visible"
     """visible: a cell's floor point is seen. over: a camera ray passes over the cell."""
-    observation: Literal["numbers", "map"] = "numbers"
-    """numbers: the twelve of the design. map: these, whether C ≥ τ, and a map of what was seen around the agent."""
+    observation: Literal["numbers", "map", "surface_map"] = "numbers"
+    """numbers: the twelve of the design. map: these, whether C ≥ τ, and a map of what was seen of the floor around the
+    agent. surface_map: these, and maps of what was seen of walls, furniture and ceiling."""
     lookup: bool = False
     """Whether views are looked up in tables of the scene instead of casting all their rays: faster, for training."""
 
@@ -76,6 +77,11 @@ class TaskSettings:
             raise UsageError(f"hfov_deg: expected degrees within (0, 180), got {self.hfov_deg!r}")
         if not 0 <= self.pitch_limit_deg < 90:
             raise UsageError(f"pitch_limit_deg: expected degrees within [0, 90), got {self.pitch_limit_deg!r}")
+
+    @property
+    def with_surface(self) -> bool:
+        """Whether what was seen of the scene's surface is computed: the reward or the observation needs it."""
+        return self.reward == "surface" or self.observation == "surface_map"
 
     @property
     def intrinsics(self) -> Intrinsics:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat import metrics, motion, poses
+from avp_habitat import motion, poses
 from avp_habitat.agent_view import AgentView
 from avp_habitat.map_observation import SIZE as MAP_SIZE
 from avp_habitat.map_observation import MapObserver
@@ -19,6 +19,8 @@ from avp_habitat.rewards import PARTS, StepFacts, has_stop, reward_parts, stops_
 from avp_habitat.senses import Perception, Senses, Views, make_senses
 from avp_habitat.settings import MOVE_FORWARD, STOP, TaskSettings
 from avp_habitat.simulators.base import Simulator
+from avp_habitat.surface_map import SIZE as SURFACE_MAP_SIZE
+from avp_habitat.surface_memory import RoomSurface, room_surfaces
 from avp_habitat.trajectory import Trajectory
 
 Float = NDArray[np.floating]
@@ -53,6 +55,7 @@ class _Room:
     maps: MapObserver
     cells: int
     rows: Rows
+    surface: RoomSurface | None
 
 
 class ViewpointTask:
@@ -74,6 +77,8 @@ class ViewpointTask:
         self.agents = agents
         self._everyone = np.arange(agents)
         self._room_of = self._everyone % len(scenes)
+        scenes = scenes[:agents]
+        surfaces = room_surfaces(scenes, settings, self._room_of)
         self._rooms = [
             _Room(
                 scene,
@@ -81,8 +86,9 @@ class ViewpointTask:
                 MapObserver(scene.area),
                 len(scene.area.centres),
                 np.flatnonzero(self._room_of == index),
+                surface,
             )
-            for index, scene in enumerate(scenes[:agents])
+            for index, (scene, surface) in enumerate(zip(scenes, surfaces, strict=True))
         ]
         self._cells = np.array([self._rooms[index].cells for index in self._room_of])
         self._diameter = np.array([self._rooms[index].simulator.area.diameter_m for index in self._room_of])
@@ -110,6 +116,14 @@ class ViewpointTask:
     def first_seen(self, row: int) -> NDArray[np.int16]:
         """`(m,)` for each cell of one agent's scene, the step whose view first observed it; 0 for never."""
         return self._first_seen[row, : self._cells[row]]
+
+    def surface_share(self, row: int) -> float | None:
+        """Σ Q / m of one agent's episode: how well it has seen the scene's surface, within [0, 1].
+
+        None where it is not computed: neither the reward nor the observation needs it.
+        """
+        surface = self._rooms[self._room_of[row]].surface
+        return None if surface is None else float(surface.quality(row).mean())
 
     def centre_depth(self, row: int) -> float:
         """Planar depth in metres in the middle of an agent's newest view, the whole range where nothing is hit."""
@@ -145,6 +159,8 @@ class ViewpointTask:
         for room, chosen in self._by_room(rows):
             seen = room.senses.look(self._views(rows[chosen]))
             least[chosen], mean[chosen] = seen.least, seen.mean
+            if room.surface is not None:
+                room.surface.reset(rows[chosen])
         return self._observe(rows, Perception(least, mean, np.zeros(len(rows), dtype=np.int64)), np.zeros(len(rows)))
 
     def step(self, actions: NDArray[np.integer]) -> StepOutcome:
@@ -159,7 +175,7 @@ class ViewpointTask:
         self._remember(self._everyone)
         seen = self._capture()
         self._observed += seen.new_cells
-        facts = self._facts(actions, seen.new_cells)
+        facts = self._facts(actions, seen.new_cells, self._capture_surface())
         parts = reward_parts(self.settings.reward, facts, self.settings.constants)
         reward = np.sum([parts[name] for name in PARTS], axis=0)
         terminated = stops_episode(facts, self.settings.constants)
@@ -192,6 +208,7 @@ class ViewpointTask:
             collided=log["collided"].astype(np.bool_),
             redundant=log["redundant"].astype(np.bool_),
             first_seen=self.first_seen(row).copy(),
+            surface=self.surface_share(row),
         )
 
     def agent_view(self, row: int) -> AgentView:
@@ -252,7 +269,15 @@ class ViewpointTask:
                 getattr(whole, column.name)[room.rows] = getattr(part, column.name)
         return whole
 
-    def _facts(self, actions: NDArray[np.integer], new_cells: NDArray[np.integer]) -> StepFacts:
+    def _capture_surface(self) -> NDArray[np.float64]:
+        """`(n,)` ΔS of the newest views; zeros where nothing needs it."""
+        gain = np.zeros(self.agents)
+        for room in self._rooms:
+            if room.surface is not None:
+                gain[room.rows] = room.surface.capture(self._views(room.rows), room.rows)
+        return gain
+
+    def _facts(self, actions: NDArray[np.integer], new_cells: NDArray[np.integer], new_surface: Float) -> StepFacts:
         from avp_habitat.history import history
 
         constants = self.settings.constants
@@ -266,6 +291,7 @@ class ViewpointTask:
         )
         return StepFacts(
             new_cells=new_cells,
+            new_surface=new_surface,
             earlier_visits=past.earlier_visits,
             spread_m=past.spread_m,
             collided=self._collided,
@@ -290,12 +316,21 @@ class ViewpointTask:
         )
         if self.settings.observation == "numbers":
             return numbers
-        maps = np.empty((len(rows), 1 + MAP_SIZE), dtype=np.float32)
+        return np.concatenate([numbers, self._maps(rows)], axis=1)
+
+    def _maps(self, rows: Rows) -> NDArray[np.float32]:
+        """`(len(rows), 1 + …)` whether C ≥ τ, the map of the floor, and those of the surface when asked for."""
+        with_surface = self.settings.observation == "surface_map"
+        floor = 1 + MAP_SIZE
+        maps = np.empty((len(rows), floor + with_surface * SURFACE_MAP_SIZE), dtype=np.float32)
         maps[:, 0] = self.coverage[rows] >= self.settings.constants.stop_coverage
         for room, chosen in self._by_room(rows):
             at = rows[chosen]
-            maps[chosen, 1:] = room.maps.observe(self._first_seen, at, self.position[at], self.yaw[at])
-        return np.concatenate([numbers, maps], axis=1)
+            maps[chosen, 1:floor] = room.maps.observe(self._first_seen, at, self.position[at], self.yaw[at])
+            if with_surface:
+                assert room.surface is not None
+                maps[chosen, floor:] = room.surface.observe(at, self.position[at], self.yaw[at])
+        return maps
 
     def _record(
         self, actions: NDArray[np.integer], reward: Float, parts: dict[str, NDArray[np.float64]], facts: StepFacts
@@ -310,29 +345,3 @@ class ViewpointTask:
         }
         for name, values in columns.items():
             self._log[name][self._everyone, self.steps - 1] = values
-
-
-def episode_metrics(trajectory: Trajectory, *, stopped: bool) -> dict[str, float]:
-    """Figures of one finished episode, by the keys of `info["avp_episode"]`.
-
-    Args:
-        trajectory: of the whole episode.
-        stopped: whether the agent ended it with enough coverage.
-
-    Returns:
-        coverage, views, annd_m, ei, path_length_m, collisions, redundant_views, stopped, and `return_PART` for each
-        part of the reward.
-    """
-    views = len(trajectory.action)
-    coverage = float(trajectory.coverage[-1]) if views else 0.0
-    return {
-        "coverage": coverage,
-        "views": float(views),
-        "annd_m": metrics.nearest_neighbour_distance(trajectory.camera_to_world[:, :3, 3]),
-        "ei": metrics.efficiency_index(coverage, views),
-        "path_length_m": metrics.path_length(trajectory.start, trajectory.position),
-        "collisions": float(trajectory.collided.sum()),
-        "redundant_views": float(trajectory.redundant.sum()),
-        "stopped": float(stopped),
-        **{f"return_{name}": float(values.sum()) for name, values in trajectory.reward_parts.items()},
-    }

@@ -1,9 +1,11 @@
-"""What one agent did in one episode, as arrays over its steps."""
+"""What one agent did in one episode, as arrays over its steps and as figures."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from avp_habitat import metrics
 
 
 @dataclass(frozen=True)
@@ -34,3 +36,33 @@ class Trajectory:
     """`(t,)` an earlier view lies close in position and in both angles."""
     first_seen: NDArray[np.int16]
     """`(m,)` for each navigable cell, the step (from 1) whose view first observed it; 0 for never."""
+    surface: float | None = None
+    """How well the scene's surface was seen at the end, within [0, 1] (`surfaces`); None where it was not computed."""
+
+
+def episode_metrics(trajectory: Trajectory, *, stopped: bool) -> dict[str, float]:
+    """Figures of one finished episode, by the keys of `info["avp_episode"]`.
+
+    Args:
+        trajectory: of the whole episode.
+        stopped: whether the agent ended it with enough coverage.
+
+    Returns:
+        coverage, views, annd_m, ei, path_length_m, collisions, redundant_views, stopped, `return_PART` for each part of
+        the reward, and surface where it was computed.
+    """
+    surface = {} if trajectory.surface is None else {"surface": trajectory.surface}
+    views = len(trajectory.action)
+    coverage = float(trajectory.coverage[-1]) if views else 0.0
+    return {
+        "coverage": coverage,
+        "views": float(views),
+        "annd_m": metrics.nearest_neighbour_distance(trajectory.camera_to_world[:, :3, 3]),
+        "ei": metrics.efficiency_index(coverage, views),
+        "path_length_m": metrics.path_length(trajectory.start, trajectory.position),
+        "collisions": float(trajectory.collided.sum()),
+        "redundant_views": float(trajectory.redundant.sum()),
+        "stopped": float(stopped),
+        **{f"return_{name}": float(values.sum()) for name, values in trajectory.reward_parts.items()},
+        **surface,
+    }

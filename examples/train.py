@@ -24,8 +24,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     add = parser.add_argument
     add("--scene", default=["builtin:0"], nargs="+", help=f"{SCENES}; agents share several")
-    add("--reward", default="proposed", help="coverage, coverage_redundancy or proposed")
-    add("--observation", default="numbers", help="numbers (the paper's twelve) or map; also chooses PPO's settings")
+    add("--reward", default="proposed", help="coverage, coverage_redundancy, proposed or surface")
+    add("--observation", default="numbers", help="numbers (the paper's twelve), map or surface_map; also chooses PPO's")
     add("--steps", default=300_000, type=int, help="environment steps in total")
     add("--agents", default=None, type=int, help="agents stepped as one batch; the settings' own when omitted")
     add("--workers", default=None, type=int, help="processes with a simulator each, a multiple of the scenes' number")

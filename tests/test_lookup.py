@@ -149,7 +149,7 @@ def test_a_disk_that_cannot_be_written_costs_a_warning(tmp_path, monkeypatch):
     monkeypatch.setenv("AVP_CACHE", str(tmp_path / "file"))
     points, words, numbers = np.zeros((1, 2), int), np.zeros((1, 1), np.uint64), np.zeros((1, 2, 3, 2), np.uint16)
     with pytest.warns(UserWarning, match="tables are not kept"):
-        TileFiles("name").write((0, 0), points, words, numbers)
+        TileFiles("name").write((0, 0), points, {"visible": words, "statistics": numbers})
 
 
 def test_an_empty_cache_variable_keeps_nothing_on_disk(monkeypatch):
@@ -157,7 +157,7 @@ def test_an_empty_cache_variable_keeps_nothing_on_disk(monkeypatch):
     assert cache_folder() is None
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        TileFiles("name").write((0, 0), np.zeros((1, 2)), np.zeros((1, 1)), np.zeros((1, 1)))
+        TileFiles("name").write((0, 0), np.zeros((1, 2)), {"visible": np.zeros((1, 1))})
 
 
 def test_tasks_with_equal_cameras_share_tables(room):

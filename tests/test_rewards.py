@@ -12,6 +12,7 @@ from avp_habitat.rewards import PARTS, REWARD_NAMES, RewardConstants, StepFacts,
 CONSTANTS = RewardConstants(
     alpha=0.13,
     alpha_proposed=0.71,
+    alpha_surface=0.83,
     beta=0.6,
     visit_decay=0.4,
     spread=0.17,
@@ -32,6 +33,7 @@ def random_facts(seed, n=6):
     rng = np.random.default_rng(seed)
     return StepFacts(
         new_cells=rng.integers(0, 200, n),
+        new_surface=rng.uniform(0, 150, n) * (rng.random(n) < 0.8),
         earlier_visits=rng.integers(0, 9, n),
         spread_m=rng.uniform(0, 4, n),
         collided=rng.random(n) < 0.5,
@@ -58,16 +60,22 @@ def by_hand(name, facts, i):
     if facts.stop_chosen[i]:
         enough = facts.coverage[i] >= c.stop_coverage
         stop = c.stop_bonus + c.stop_per_step_left * int(facts.steps_left[i]) if enough else -c.early_stop
-    return {
-        "coverage": c.alpha_proposed
-        / (1 + c.visit_decay * int(facts.earlier_visits[i]))
-        * int(facts.new_cells[i]) ** c.beta,
-        "spread": spread,
-        "step": -c.step,
-        "collision": collision,
-        "redundancy": redundancy,
-        "stop": stop,
-    }
+    discount = 1 + c.visit_decay * int(facts.earlier_visits[i])
+    if name == "surface":
+        new = {"surface": c.alpha_surface / discount * float(facts.new_surface[i]) ** c.beta}
+    else:
+        new = {"coverage": c.alpha_proposed / discount * int(facts.new_cells[i]) ** c.beta}
+    return (
+        parts
+        | new
+        | {
+            "spread": spread,
+            "step": -c.step,
+            "collision": collision,
+            "redundancy": redundancy,
+            "stop": stop,
+        }
+    )
 
 
 @pytest.mark.parametrize("name", REWARD_NAMES)
@@ -82,8 +90,8 @@ def test_every_part_equals_the_formula_by_hand(name, seed):
             assert parts[part][i] == pytest.approx(expected[part]), (name, part)
 
 
-def test_only_the_proposed_reward_has_a_stop():
-    assert [name for name in REWARD_NAMES if has_stop(name)] == ["proposed"]
+def test_only_the_proposed_and_the_surface_reward_have_a_stop():
+    assert [name for name in REWARD_NAMES if has_stop(name)] == ["proposed", "surface"]
 
 
 def test_stopping_needs_the_choice_and_the_coverage():

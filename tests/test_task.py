@@ -18,7 +18,8 @@ from avp_habitat.settings import (
     TURN_RIGHT,
     TaskSettings,
 )
-from avp_habitat.task import ViewpointTask, episode_metrics
+from avp_habitat.task import ViewpointTask
+from avp_habitat.trajectory import episode_metrics
 
 SIMULATOR = Corridor()
 AREA = SIMULATOR.area
@@ -79,6 +80,7 @@ class ByHand:
         new = self.observe()
         facts = StepFacts(
             new_cells=np.array([new]),
+            new_surface=np.array([0.0]),
             earlier_visits=np.array([visits]),
             spread_m=np.array([self.spread()]),
             collided=np.array([self.collided]),

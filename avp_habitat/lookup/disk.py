@@ -4,6 +4,7 @@ import os
 import tempfile
 import warnings
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -30,35 +31,23 @@ class TileFiles:
         self._folder = None if folder is None else folder / "tables" / name
 
     def read(
-        self,
-        tile: tuple[int, int],
-        points: NDArray[np.integer],
-        visible_like: NDArray[np.uint64],
-        statistics_like: NDArray[np.uint16],
-    ) -> tuple[NDArray[np.uint64], NDArray[np.uint16]] | None:
-        """A tile's tables, or None where there is no sound file for these `(k, 2)` points and shapes."""
+        self, tile: tuple[int, int], points: NDArray[np.integer], like: Mapping[str, NDArray]
+    ) -> dict[str, NDArray] | None:
+        """A tile's tables by name, or None where there is no sound file for these `(k, 2)` points and shapes."""
         if self._folder is None:
             return None
         try:
             with np.load(self._path(self._folder, tile)) as file:
-                found, visible, statistics = file["points"], file["visible"], file["statistics"]
+                found, columns = file["points"], {name: file[name] for name in like}
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return None
-        sound = (
-            np.array_equal(found, points)
-            and (visible.dtype, visible.shape) == (visible_like.dtype, (len(points), *visible_like.shape[1:]))
-            and (statistics.dtype, statistics.shape)
-            == (statistics_like.dtype, (len(points), *statistics_like.shape[1:]))
+        sound = np.array_equal(found, points) and all(
+            (column.dtype, column.shape) == (like[name].dtype, (len(points), *like[name].shape[1:]))
+            for name, column in columns.items()
         )
-        return (visible, statistics) if sound else None
+        return columns if sound else None
 
-    def write(
-        self,
-        tile: tuple[int, int],
-        points: NDArray[np.integer],
-        visible: NDArray[np.uint64],
-        statistics: NDArray[np.uint16],
-    ) -> None:
+    def write(self, tile: tuple[int, int], points: NDArray[np.integer], columns: Mapping[str, NDArray]) -> None:
         """Keep a tile; a full or read-only disk costs a warning."""
         if self._folder is None:
             return
@@ -67,7 +56,7 @@ class TileFiles:
             # Another process may write the same tile: each writes its own file, and the last rename wins.
             with tempfile.NamedTemporaryFile(dir=self._folder, suffix=".part", delete=False) as file:
                 try:
-                    np.savez(file, points=points, visible=visible, statistics=statistics)
+                    np.savez(file, allow_pickle=False, points=points, **columns)
                     file.close()
                     os.replace(file.name, self._path(self._folder, tile))
                 except BaseException:

@@ -80,6 +80,65 @@ def new_cells(visible, slots, pose, centres, camera, max_range, rows, steps, fir
 
 
 @njit(cache=True)
+def new_surface(
+    visible, slots, pose, points, normals, camera, max_range, full_distance, rows, quality, gain, doubtful, doubtful_q
+):
+    """Raise the qualities of the surface points that agents' views show better than before.
+
+    Args:
+        visible: `(slots, words)` of the tables.
+        slots: `(k, 4)` places around each agent.
+        pose: `(k, 4, 4)` camera_to_world, habitat axes.
+        points: `(m, 3)` metres.
+        normals: `(m, 3)` unit vectors.
+        camera: `(6,)` width, height, fx, fy, cx, cy in pixels.
+        max_range: metres.
+        full_distance: d₀ of `surfaces.view_quality`, metres.
+        rows: `(k,)` each agent's row of `quality`.
+        quality: `(n, m)` best so far; written for points that all four places see.
+        gain: `(k,)` output, by how much it grew.
+        doubtful: `(c, 2)` output, pairs (index of the agent, point) on which the places differ.
+        doubtful_q: `(c,)` output, the quality of those pairs' views.
+
+    Returns:
+        How many pairs are doubtful; beyond c they are counted but not written.
+    """
+    doubts = 0
+    for k in range(len(slots)):
+        a, b, c, d = visible[slots[k, 0]], visible[slots[k, 1]], visible[slots[k, 2]], visible[slots[k, 3]]
+        best = quality[rows[k]]
+        total = 0.0
+        for word in range(visible.shape[1]):
+            some = a[word] | b[word] | c[word] | d[word]
+            every = a[word] & b[word] & c[word] & d[word]
+            point = 64 * word
+            while some != 0:
+                if some & ONE and best[point] < 1 and _in_view(pose[k], points[point], camera, max_range):
+                    value = np.float32(_view_quality(pose[k], points[point], normals[point], full_distance))
+                    if value > best[point]:
+                        if every & ONE:
+                            total += value - best[point]
+                            best[point] = value
+                        else:
+                            if doubts < len(doubtful):
+                                doubtful[doubts, 0], doubtful[doubts, 1] = k, point
+                                doubtful_q[doubts] = value
+                            doubts += 1
+                some, every, point = some >> ONE, every >> ONE, point + 1
+        gain[k] = total
+    return doubts
+
+
+@njit(cache=True)
+def _view_quality(pose, point, normal, full_distance):
+    """The rule of `surfaces.view_quality`."""
+    x, y, z = pose[0, 3] - point[0], pose[1, 3] - point[1], pose[2, 3] - point[2]
+    distance = max(np.sqrt(x * x + y * y + z * z), 1e-9)
+    cosine = (x * normal[0] + y * normal[1] + z * normal[2]) / distance
+    return min(max(cosine, 0.0), 1.0) * min(1.0, full_distance / distance)
+
+
+@njit(cache=True)
 def _in_view(pose, point, camera, max_range):
     """Whether a point lies inside the image and within range; the rule of `coverage.candidates`."""
     width, height, fx, fy, cx, cy = camera

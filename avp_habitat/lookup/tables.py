@@ -17,15 +17,16 @@ from numpy.typing import NDArray
 from avp_habitat.errors import UsageError
 from avp_habitat.lookup import panorama
 from avp_habitat.lookup.disk import TileFiles
-from avp_habitat.lookup.lattice import TILE, Lattice
-from avp_habitat.poses import Intrinsics, camera_to_world
+from avp_habitat.lookup.lattice import Lattice
+from avp_habitat.lookup.rows import PlaceRows, words_for
+from avp_habitat.lookup.sight import seen_bits
+from avp_habitat.poses import Intrinsics
 from avp_habitat.settings import TaskSettings
 from avp_habitat.simulators.base import Simulator
 
 SPACING_M = 0.1
 """Distance between lattice points in metres. At 0.2 m the least depth is off by twice as much (docs/training.md)."""
 _VERSION = 2
-_PLACES_PER_CALL = 64
 
 
 @runtime_checkable
@@ -77,72 +78,37 @@ class SceneTables:
         self._samples = panorama.view_samples(key.intrinsics, key.pitches)
         self._directions = panorama.directions().reshape(-1, 3)
         self.lattice = Lattice(simulator.area, key.spacing_m)
-        self._cells = len(simulator.area.centres)
-        self._slot = np.full(self.lattice.shape, -1, dtype=np.int32)
-        self._tiles: set[tuple[int, int]] = set()
-        self.visible = np.zeros((0, -(-self._cells // 64)), dtype=np.uint64)
-        """`(slots, words)`: bit c % 64 of word c // 64 says whether cell c is seen from the slot's place."""
-        self.statistics = np.zeros((0, panorama.YAWS, len(key.pitches), 2), dtype=np.uint16)
-        """`(slots, yaws, pitches, 2)` least and mean depth, 65535 for the whole range."""
+        centres = simulator.area.centres
         # Bits stand for cells: another NavMesh of the same scene has others.
-        content = hashlib.sha256(simulator.area.centres.tobytes())
+        content = hashlib.sha256(centres.tobytes())
         content.update(f"{simulator.scene_digest} {_VERSION} {astuple(key)}".encode())
-        self._files = TileFiles(content.hexdigest()[:32])
+        empty = {
+            "visible": np.zeros((0, words_for(len(centres))), dtype=np.uint64),
+            "statistics": np.zeros((0, panorama.YAWS, len(key.pitches), 2), dtype=np.uint16),
+        }
+        self._rows = PlaceRows(self.lattice, TileFiles(content.hexdigest()[:32]), empty, self._compute)
+
+    @property
+    def visible(self) -> NDArray[np.uint64]:
+        """`(slots, words)`: bit c % 64 of word c // 64 says whether cell c is seen from the slot's place."""
+        return self._rows.columns["visible"]
+
+    @property
+    def statistics(self) -> NDArray[np.uint16]:
+        """`(slots, yaws, pitches, 2)` least and mean depth, 65535 for the whole range."""
+        return self._rows.columns["statistics"]
 
     def around(self, position: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-        """The slots around places, made now where they are new.
+        """The slots around places; see `PlaceRows.around`."""
+        return self._rows.around(position)
 
-        Args:
-            position: `(k, 3)` feet, metres.
-
-        Returns:
-            `(k, 4)` slots and `(k, 4)` weights that sum to 1.
-        """
-        points, weight = self.lattice.around(position)
-        slots = self._slot[points[..., 0], points[..., 1]]
-        if (slots < 0).any():
-            self._make(points[slots < 0])
-            slots = self._slot[points[..., 0], points[..., 1]]
-        return slots, weight.astype(np.float32)
-
-    def _make(self, points: NDArray[np.integer]) -> None:
-        for tile in sorted({(int(i), int(j)) for i, j in points // TILE} - self._tiles):
-            self._tiles.add(tile)
-            wanted = self.lattice.points_of_tile(tile)
-            table = self._files.read(tile, wanted, self.visible, self.statistics)
-            if table is None:
-                table = self._compute(wanted)
-                self._files.write(tile, wanted, *table)
-            self._add(wanted, *table)
-        # An agent in a sliver of floor too thin to hold a cell's centre stands beside points that no tile has.
-        lacking = np.unique(points[self._slot[points[:, 0], points[:, 1]] < 0], axis=0)
-        if len(lacking):
-            self._add(lacking, *self._compute(lacking))
-
-    def _add(self, points: NDArray[np.integer], visible: NDArray[np.uint64], statistics: NDArray[np.uint16]) -> None:
-        self._slot[points[:, 0], points[:, 1]] = np.arange(len(points)) + len(self.visible)
-        self.visible = np.concatenate([self.visible, visible])
-        self.statistics = np.concatenate([self.statistics, statistics])
-
-    def _compute(self, points: NDArray[np.integer]) -> tuple[NDArray[np.uint64], NDArray[np.uint16]]:
-        eyes = self.lattice.feet(points) + [0.0, self.key.sensor_height_m, 0.0]
-        visible, statistics = [self.visible[:0]], [self.statistics[:0]]
-        for start in range(0, len(eyes), _PLACES_PER_CALL):
-            eye = eyes[start : start + _PLACES_PER_CALL]
-            visible.append(self._visible_from(eye))
-            statistics.append(self._statistics_from(eye))
-        return np.concatenate(visible), np.concatenate(statistics)
-
-    def _visible_from(self, eye: NDArray[np.floating]) -> NDArray[np.uint64]:
+    def _compute(self, feet: NDArray[np.floating]) -> dict[str, NDArray]:
+        eye = feet + [0.0, self.key.sensor_height_m, 0.0]
         centres = self._simulator.area.centres
         # A place is less than a lattice diagonal away from its points, so that cells a little out of range count too.
         reach = self.key.max_range_m + 2 * self.key.spacing_m
-        pairs = np.argwhere(((centres[None] - eye[:, None]) ** 2).sum(axis=-1) < reach**2)
-        poses = camera_to_world(eye, yaw=np.zeros(len(eye)), pitch=np.zeros(len(eye)))
-        seen = self._simulator.visible(poses, centres, pairs, tolerance_m=self.key.tolerance_m)
-        bits = np.zeros((len(eye), self.visible.shape[1] * 64), dtype=np.bool_)
-        bits[pairs[seen, 0], pairs[seen, 1]] = True
-        return np.packbits(bits, axis=1, bitorder="little").view("<u8").astype(np.uint64)
+        visible = seen_bits(self._simulator, eye, centres, reach_m=reach, tolerance_m=self.key.tolerance_m)
+        return {"visible": visible, "statistics": self._statistics_from(eye)}
 
     def _statistics_from(self, eye: NDArray[np.floating]) -> NDArray[np.uint16]:
         origin = np.repeat(eye, len(self._directions), axis=0)
