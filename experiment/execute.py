@@ -4,12 +4,13 @@ Importing torch, nerfstudio and Stable-Baselines3 takes 10 to 20 seconds of a co
 multiprocessing's forkserver pays it once; the commands still run apart from each other, each with a log file.
 """
 
-import ctypes
 import importlib
+import multiprocessing
 import os
 import runpy
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
@@ -26,7 +27,6 @@ from experiment.store import Store
 
 NO_FACTS = 3
 """Exit code of a cell whose command succeeded, but whose result cannot be read."""
-_PR_SET_PDEATHSIG = 1
 _MLFLOW_OURS = ("MLFLOW_RUN_ID", "MLFLOW_EXPERIMENT_ID", "MLFLOW_EXPERIMENT_NAME")
 
 
@@ -51,7 +51,7 @@ def environment(tracking_uri: str) -> dict[str, str]:
 
 def execute(order: Order) -> None:
     """Run a cell's command in this process, note what came of it, and end the process with the command's exit code."""
-    _die_with_parent()
+    threading.Thread(target=_end_with_experiment, name="end with the experiment", daemon=True).start()
     os.environ.clear()
     os.environ.update(order.environment)
     store = Store(order.root)
@@ -107,10 +107,15 @@ def _arguments(words: Sequence[str]) -> list[str]:
     return list(words[3:] if words[1] == "-m" else words[2:])
 
 
-def _die_with_parent() -> None:
-    """Ask the kernel to end this process when the one that forked it ends, also by SIGKILL."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+def _end_with_experiment() -> None:
+    """End this process when the experiment ends, also by SIGKILL, or two programs would write one cell.
+
+    The process that forked this one lives on as long as its children do, so that waiting for that one is no help.
+    """
+    experiment = multiprocessing.parent_process()
+    assert experiment is not None
+    experiment.join()
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def last_words(log: Path, lines: int = 3) -> str:

@@ -29,4 +29,7 @@ def run(root, cells, jobs=1):
 
 if __name__ == "__main__":
     folder = Path(sys.argv[1])
-    print(json.dumps(run(folder, rollouts(folder)).failed))
+    chosen = rollouts(folder)
+    if len(sys.argv) > 2:  # a program to run instead of the first rollout's
+        chosen = [replace(chosen[0], words=("python", sys.argv[2]))]
+    print(json.dumps(run(folder, chosen).failed))

@@ -17,10 +17,10 @@ ROOT = Path(__file__).resolve().parent.parent
 PROGRAM = Path(experiment_walks.__file__)
 
 
-def start(folder):
+def start(folder, *more):
     """The small experiment as a process of its own, which leads a session, so that nothing else gets its signals."""
     env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    words = [sys.executable, str(PROGRAM), str(folder)]
+    words = [sys.executable, str(PROGRAM), str(folder), *map(str, more)]
     return subprocess.Popen(words, cwd=ROOT, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
                             start_new_session=True)  # fmt: skip
 
@@ -63,6 +63,19 @@ def test_killed_half_way_it_goes_on_with_what_is_missing_and_repeats_nothing(tmp
         assert record["facts"]["visibility_curve"][-1] == pytest.approx(
             record["facts"]["metrics"]["visibility"], abs=1e-6
         )
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_no_cell_outlives_the_experiment(tmp_path, number):
+    program = tmp_path / "waits.py"
+    program.write_text(f"import pathlib, time\ndef main(argv):\n    pathlib.Path({str(tmp_path)!r}, 'begun').touch()\n"
+                       "    time.sleep(600)\n")  # fmt: skip
+    experiment = start(tmp_path, program)
+    wait_for((tmp_path / "begun").exists)
+    assert len(processes_of(experiment.pid)) > 1
+    os.kill(experiment.pid, number)
+    experiment.communicate()
+    wait_for(lambda: not processes_of(experiment.pid), 20)
 
 
 def test_an_interruption_ends_what_is_running_and_keeps_what_is_done(tmp_path):
