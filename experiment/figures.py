@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 CPV, REWARD = "avp/cpv", "rollout/ep_rew_mean"
 _GRID = 200
+_MILLION = 1e6
 _ROLES = {"train": "scene of training", "unseen": "unseen scene"}
 
 
@@ -46,7 +47,7 @@ def cpv_while_training(results: Results) -> Made:
     axes = picture.subplots()
     for method in methods:
         _training_curve(axes, results, method, CPV)
-    axes.set(xlabel="environment steps while training", ylabel="CpV [% coverage per view]")
+    axes.set(xlabel="environment steps while training [millions]", ylabel="CpV [% coverage per view]")
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right", ncols=2, fontsize=9)
     return Made(
@@ -65,10 +66,9 @@ def reward_while_training(results: Results) -> Made:
         _training_curve(axes, results, method, REWARD)
         axes.set_title(method, fontsize=10)
         axes.grid(alpha=0.3)
-        axes.ticklabel_format(axis="x", style="sci", scilimits=(5, 5))
     for axes in panels[len(methods) :]:
         axes.set_axis_off()
-    picture.supxlabel("environment steps while training", fontsize=10)
+    picture.supxlabel("environment steps while training [millions]", fontsize=10)
     picture.supylabel("mean reward of an episode", fontsize=10)
     caption = (
         "Mean reward of the episodes finished while training. Rewards differ in what they count, so each panel has its "
@@ -155,9 +155,11 @@ def _training_curve(axes: "Axes", results: Results, method: str, metric: str) ->
     steps = np.linspace(first, last, _GRID)
     values = np.array([np.interp(steps, curve[:, 0], curve[:, 1]) for curve in curves])
     look = look_of(method)
-    axes.plot(steps, values.mean(axis=0), look.line, color=look.colour, label=method, linewidth=1.8)
+    axes.plot(steps / _MILLION, values.mean(axis=0), look.line, color=look.colour, label=method, linewidth=1.8)
     if len(values) > 1:
-        axes.fill_between(steps, values.min(axis=0), values.max(axis=0), color=look.colour, alpha=0.18, linewidth=0)
+        axes.fill_between(
+            steps / _MILLION, values.min(axis=0), values.max(axis=0), color=look.colour, alpha=0.18, linewidth=0
+        )
 
 
 def _psnr_curve(axes: "Axes", results: Results, method: str, role: str) -> None:

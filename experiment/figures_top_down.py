@@ -103,16 +103,17 @@ def _draw_map(axes: "Axes", rollout: Rollout, numbers: np.ndarray, last: int) ->
     base = np.ma.masked_where(numbers == NOT_NAVIGABLE, np.zeros(numbers.shape))
     axes.imshow(base, extent=extent, cmap=ListedColormap([_UNSEEN_COLOUR]), interpolation="nearest")
     seen = np.ma.masked_where(numbers <= NEVER, numbers.astype(float) - 1)
-    image = axes.imshow(seen, extent=extent, cmap="viridis", vmin=1, vmax=last, interpolation="nearest")
+    image = axes.imshow(seen, extent=extent, cmap="YlGnBu", vmin=1, vmax=last, interpolation="nearest")
     path = np.array(rollout.floor["path"], dtype=np.float64).reshape(-1, 3)
     ahead = heading(path[:, 2])[:, [0, 2]]
-    axes.plot(path[:, 0], path[:, 1], color=_PATH_COLOUR, linewidth=1.4)
+    axes.plot(path[:, 0], path[:, 1], color="white", linewidth=3.2)
+    axes.plot(path[:, 0], path[:, 1], color=_PATH_COLOUR, linewidth=1.6)
     arrows: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1 / _ARROW_M, "width": 0.006}
-    axes.quiver(path[:, 0], path[:, 1], ahead[:, 0], ahead[:, 1], color="#F07F33", **arrows)
+    axes.quiver(path[:, 0], path[:, 1], ahead[:, 0], ahead[:, 1], color="black", zorder=4, **arrows)
     for place, colour in ((path[0], "white"), (path[-1], _PATH_COLOUR)):
-        axes.plot(*place[:2], "o", color=colour, markeredgecolor="black", markersize=6)
+        axes.plot(*place[:2], "o", color=colour, markeredgecolor="black", markersize=6, zorder=5)
     axes.set_title(
-        f"{rollout.method}: {len(path)} views, {100 * rollout.metrics['coverage']:.0f} % coverage", fontsize=10
+        f"{rollout.method}: {len(path)} views, {100 * rollout.metrics['coverage']:.0f} % coverage", fontsize=9
     )
     axes.tick_params(labelsize=8)
     axes.set_facecolor(_OUTSIDE_COLOUR)

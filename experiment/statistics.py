@@ -142,27 +142,39 @@ def spearman(x: ArrayLike, y: ArrayLike, rollout: Sequence[object]) -> Correlati
     if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
         return None
     names = {name: number for number, name in enumerate(dict.fromkeys(rollout))}
-    members = [np.flatnonzero([names[name] == number for name in rollout]) for number in range(len(names))]
-    low, high = _bootstrap(x, y, members) if len(names) > 1 else (np.nan, np.nan)
-    return Correlation(_rho(x, y), low, high, len(x), len(names))
+    member = np.array([names[name] for name in rollout])
+    low, high = _bootstrap(x, y, member, len(names)) if len(names) > 1 else (np.nan, np.nan)
+    return Correlation(float(_rho(x, y, np.ones((1, len(x))))[0]), low, high, len(x), len(names))
 
 
-def _bootstrap(x: NDArray, y: NDArray, members: list[NDArray]) -> tuple[float, float]:
-    """Percentile interval over draws of whole rollouts."""
+def _bootstrap(x: NDArray, y: NDArray, member: NDArray, rollouts: int) -> tuple[float, float]:
+    """Percentile interval over draws of whole rollouts; a rollout drawn k times counts k times."""
     rng = np.random.default_rng(_BOOTSTRAP_SEED)
-    draws = rng.integers(len(members), size=(RESAMPLES, len(members)))
-    found = []
-    for draw in draws:
-        chosen = np.concatenate([members[number] for number in draw])
-        if np.ptp(x[chosen]) > 0 and np.ptp(y[chosen]) > 0:
-            found.append(_rho(x[chosen], y[chosen]))
-    if not found:
+    times = rng.multinomial(rollouts, np.full(rollouts, 1 / rollouts), size=RESAMPLES)
+    found = _rho(x, y, times[:, member].astype(np.float64))
+    found = found[np.isfinite(found)]
+    if not len(found):
         return np.nan, np.nan
     low, high = np.quantile(found, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return float(low), float(high)
 
 
-def _rho(x: NDArray, y: NDArray) -> float:
-    from scipy.stats import rankdata
+def _rho(x: NDArray, y: NDArray, times: NDArray) -> NDArray:
+    """`(r,)` ρ of `(n,)` points that count `(r, n)` times; nan where one of the two does not vary."""
+    ranks = [_ranks(values, times) for values in (x, y)]
+    total = times.sum(axis=1, keepdims=True)
+    first, second = (rank - (times * rank).sum(axis=1, keepdims=True) / total for rank in ranks)
+    products = [
+        (times * left * right).sum(axis=1) for left, right in ((first, second), (first, first), (second, second))
+    ]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return products[0] / np.sqrt(products[1] * products[2])
 
-    return float(np.corrcoef(rankdata(x), rankdata(y))[0, 1])
+
+def _ranks(values: NDArray, times: NDArray) -> NDArray:
+    """`(r, n)` ranks of `(n,)` values that count `(r, n)` times; equal values share their mean rank."""
+    _, place = np.unique(values, return_inverse=True)
+    order = np.argsort(place, kind="stable")
+    starts = np.flatnonzero(np.diff(place[order], prepend=-1))
+    together = np.add.reduceat(times[:, order], starts, axis=1)
+    return (np.cumsum(together, axis=1) - together / 2)[:, place]

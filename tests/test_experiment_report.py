@@ -1,0 +1,423 @@
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from experiment_results import METHODS, SCENES, make_results, write_results
+from PIL import Image
+from scipy import stats
+from small_rollout import write_small_rollout
+
+from avp_habitat import command, images
+from avp_habitat.errors import AVPError, RolloutError, UsageError
+from experiment.floor_map import floor_map, floor_of
+from experiment.report import main, write_report
+from experiment.statistics import at_views, spearman, views_to_reach
+from experiment.stored import read_results
+
+ROOT = Path(__file__).resolve().parent.parent
+FIGURES = ("figure3", "figure4", "figure5", "figure6", "figure6_unseen", "psnr_by_views", "visibility")
+FEW = ("heuristic", "coverage", "proposed", "surface")
+TRAIN_ONLY = SCENES[:1]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Results of all methods, and the folder of their report."""
+    results = make_results()
+    folder = write_results(tmp_path_factory.mktemp("whole"), results)
+    write_report(folder)
+    return results, folder
+
+
+@pytest.fixture
+def report(tmp_path, monkeypatch):
+    """Makes a report without figures, which take most of the time, and returns its folder."""
+    monkeypatch.setattr("experiment.report._figures", lambda shown: {})
+
+    def make(results):
+        write_report(write_results(tmp_path, results, pictures=False))
+        return tmp_path
+
+    return make
+
+
+def rows_of(path):
+    with path.open(newline="", encoding="utf-8") as file:
+        return {row["method"]: row for row in csv.DictReader(file)}
+
+
+def by_seed(parts, value, **wanted):
+    """Means of a figure by seed, computed without the report's code."""
+    found = {}
+    for part in parts:
+        if all(part[name] == wish for name, wish in wanted.items()):
+            found.setdefault(part["seed"], []).append(value(part))
+    return [sum(values) / len(values) for values in found.values()]
+
+
+def interval(values):
+    """Mean and half width of the 95 % interval, as SciPy computes it."""
+    mean = float(np.mean(values))
+    low, high = stats.t.interval(0.95, len(values) - 1, loc=mean, scale=stats.sem(values))
+    return mean, (high - low) / 2
+
+
+@pytest.mark.parametrize(("table", "role"), [("table2", "train"), ("table3", "unseen")])
+def test_the_tables_hold_means_and_intervals_over_seeds(whole, table, role):
+    results, folder = whole
+    rows, text = rows_of(folder / f"{table}.csv"), (folder / f"{table}.md").read_text()
+    assert list(rows) == results["methods"]
+    for method in results["methods"]:
+        of = {"method": method, "role": role}
+        figures = {
+            "coverage [%]": by_seed(results["rollouts"], lambda one: 100 * one["metrics"]["coverage"], **of),
+            "EI [%/view]": by_seed(results["rollouts"], lambda one: 100 * one["metrics"]["ei"], **of),
+            "PSNR [dB]": by_seed(results["reconstructions"], lambda one: one["scores"]["psnr"], whole=True, **of),
+        }
+        for title, values in figures.items():
+            mean, half = interval(values)
+            assert float(rows[method][title]) == pytest.approx(mean, rel=1e-5)
+            assert float(rows[method][f"± {title}"]) == pytest.approx(half, rel=1e-4)
+        mean, half = interval(figures["PSNR [dB]"])
+        (line,) = [line for line in text.splitlines() if line.startswith(f"| {method} ")]
+        assert f" {mean:.2f} ± {half:.2f} " in line
+
+
+def test_another_number_in_the_results_is_another_number_in_the_table(report):
+    results = make_results(FEW, scenes=TRAIN_ONLY)
+    before = (report(results) / "table2.md").read_text()
+    changed = next(one for one in results["reconstructions"] if one["method"] == "proposed" and one["whole"])
+    changed["scores"]["psnr"] += 3
+    after = (report(results) / "table2.md").read_text()
+    different = [a for a, b in zip(before.splitlines(), after.splitlines(), strict=True) if a != b]
+    assert [line.split()[1] for line in different] == ["proposed"]
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_every_figure_is_a_picture_of_modest_size_with_something_in_it(whole, name):
+    path = whole[1] / f"{name}.png"
+    assert path.stat().st_size < 300_000
+    with Image.open(path) as picture:
+        assert 700 <= picture.width <= 1200
+        colours = np.asarray(picture.convert("RGB")).reshape(-1, 3)
+    assert len(np.unique(colours, axis=0)) > 50
+
+
+def test_the_page_holds_tables_figures_claims_and_where_they_come_from(whole):
+    _, folder = whole
+    page = (folder / "results.md").read_text()
+    for part in ("mlflow run . -e compare", "0123456789ab", "a processor", "torch 2.9", "3 seeds"):
+        assert part in page
+    for name in FIGURES:
+        assert f"]({name}.png)" in page
+    assert (folder / "table2.md").read_text().splitlines()[2] in page
+    assert "### Visibility as a predictor of PSNR" in page
+    assert page.rstrip().endswith("Nothing.")
+
+
+def test_what_was_read_by_hand_becomes_part_of_the_page(report, tmp_path):
+    (tmp_path / "reading.md").write_text("# What this shows\n\nA room of one's own.\n")
+    page = (report(make_results(FEW)) / "results.md").read_text()
+    assert "## What this shows\n\nA room of one's own." in page
+
+
+def section(folder, title):
+    return (folder / "claims.md").read_text().partition(f"## {title}")[2].partition("\n## ")[0]
+
+
+def change(results, method, **by):
+    """Add to views or PSNR, or multiply coverage, of all episodes of a method."""
+    for one in results["rollouts"]:
+        if one["method"] == method:
+            one["metrics"]["views"] += by.get("views", 0)
+            one["metrics"]["coverage"] *= by.get("coverage", 1)
+    for one in results["reconstructions"]:
+        if one["method"] == method:
+            one["scores"]["psnr"] += by.get("psnr", 0)
+
+
+@pytest.mark.parametrize(
+    ("method", "by", "words"),
+    [
+        ("heuristic", {}, "the heuristic is clearly below every learned policy in coverage and PSNR"),
+        ("heuristic", {"psnr": 20}, "the heuristic is **not** below every learned policy in coverage and PSNR"),
+        ("heuristic", {"coverage": 5}, "the heuristic is **not** below"),
+        ("surface", {"psnr": -8.2}, "not every difference has an interval above 0"),
+    ],
+)
+def test_the_heuristic_is_called_worse_only_where_it_is(report, method, by, words):
+    results = make_results(FEW, scenes=TRAIN_ONLY)
+    change(results, method, **by)
+    assert words in section(report(results), "Heuristic")
+
+
+@pytest.mark.parametrize(
+    ("by", "words"),
+    [
+        ({"psnr": 2}, "**holds**, also at the unfavourable ends"),
+        ({"psnr": 0.1}, "**holds** by the means, not over the whole intervals"),
+        ({"psnr": -2}, "**does not hold**"),
+        ({"psnr": 2, "views": 20}, "**does not hold**"),
+    ],
+)
+def test_fewer_views_at_equal_psnr_holds_only_where_it_does(report, by, words):
+    results = make_results(FEW, scenes=TRAIN_ONLY)
+    # Less scatter between seeds, so that the whole interval of the views lies on one side.
+    for one in results["rollouts"]:
+        if one["method"] == "proposed":
+            one["metrics"]["views"] = 54.0 + one["seed"]
+    change(results, "proposed", **by)
+    said = section(report(results), "`proposed` against `coverage`")
+    assert words in said
+    share = np.mean([1 - (54 + seed + by.get("views", 0)) / 80 for seed in range(3)])
+    assert f"takes {100 * share:.1f} ± " in said
+
+
+def test_surface_is_compared_at_equal_views_and_at_equal_psnr(report):
+    results = make_results(("proposed", "surface"), scenes=TRAIN_ONLY, starts=1, prefixes=(20, 40))
+    exact = {"proposed": {20: 10.0, 40: 14.0, 50: 15.0}, "surface": {20: 12.0, 40: 16.0, 60: 18.0}}
+    for one in results["reconstructions"]:
+        one["views"] = {"proposed": 50, "surface": 60}[one["method"]]
+        one["frames"] = one["views"] if one["whole"] else one["frames"]
+        one["scores"]["psnr"] = exact[one["method"]][one["frames"]] + 0.5 * one["seed"]
+    said = section(report(results), "`surface` against")
+    # At 50 views surface lies half way between 16 and 18, proposed at 15; 15 is three quarters of the way to 16.
+    assert "differs by +2.00 ± 0.00 dB: higher, the whole interval too" in said
+    assert (
+        "reached by `surface` after 35.0 ± 0.0 views where `proposed` took 50.0 ± 0.0: +15.0 ± 0.0 views saved." in said
+    )
+    assert "The final PSNR of `surface` is reached by `proposed` in none of 3 episodes: never reached." in said
+    change(results, "surface", psnr=-6)
+    assert "differs by -4.00 ± 0.00 dB: lower, the whole interval too" in section(report(results), "`surface` against")
+
+
+def test_the_correlation_is_that_of_scipy_and_called_what_it_is(report):
+    results = make_results(FEW, scenes=TRAIN_ONLY)
+    known = [(one["visibility"], one["scores"]["psnr"]) for one in results["reconstructions"]]
+    rho = stats.spearmanr(*zip(*known, strict=True))[0]
+    said = section(report(results), "Visibility")
+    assert f"have ρ = {rho:.2f} [" in said
+    for one in results["reconstructions"]:
+        one["scores"]["psnr"] = 30 * one["visibility"]
+    assert "have ρ = 1.00 [1.00, 1.00], at least 0.8" in section(report(results), "Visibility")
+    for one in results["reconstructions"]:
+        one["scores"]["psnr"] = -one["scores"]["psnr"]
+    assert "have ρ = -1.00 [-1.00, -1.00], below 0.8" in section(report(results), "Visibility")
+
+
+def test_correlation_with_equal_values_is_that_of_scipy():
+    rng = np.random.default_rng(3)
+    x, y = rng.integers(0, 6, (2, 60))
+    assert spearman(x, y, list(range(60))).rho == pytest.approx(stats.spearmanr(x, y)[0])
+    assert spearman(x, np.ones(60), list(range(60))) is None
+
+
+def test_reconstructions_of_one_rollout_are_drawn_together():
+    rng = np.random.default_rng(0)
+    x = np.repeat(rng.normal(size=12), 10)
+    y = np.repeat(rng.normal(size=12), 10)
+    together = spearman(x, y, np.repeat(np.arange(12), 10).tolist())
+    apart = spearman(x, y, list(range(120)))
+    assert together.rho == apart.rho
+    assert together.high - together.low > 2 * (apart.high - apart.low)
+
+
+def test_between_measured_views_a_curve_is_linear_and_outside_it_is_unknown():
+    curve = {20: 10.0, 40: 14.0, 60: 13.0, 80: 20.0}
+    assert at_views(curve, 30) == 12
+    assert at_views(curve, 80) == 20
+    assert at_views(curve, 19) is None
+    assert at_views(curve, 81) is None
+    assert views_to_reach(curve, 12) == 30
+    assert views_to_reach(curve, 16.5) == 70
+    assert views_to_reach(curve, 9) == 20
+    assert views_to_reach(curve, 21) is None
+
+
+def test_a_failed_cell_is_named_with_its_reason(report):
+    results = make_results(FEW)
+    results["failed"] = [{"cell": "train/surface-1", "reason": "exit code 1: no memory", "log": "cells/log.txt"}]
+    assert "`train/surface-1`: exit code 1: no memory" in section(report(results), "Cells that failed")
+
+
+def without(part, **wanted):
+    """Drops entries from a part of the results."""
+
+    def drop(results):
+        results[part] = [one for one in results[part] if not all(one[name] == value for name, value in wanted.items())]
+
+    return drop
+
+
+INCOMPLETE = {
+    "nothing done": (
+        lambda results: [results.update({part: []}) for part in ("training", "rollouts", "reconstructions")],
+        ["Table 2: scenes of training: no episode there is done", "no training has a curve of avp/cpv"],
+    ),
+    "no reconstruction": (
+        lambda results: results.update(reconstructions=[]),
+        ["PSNR by views: no reconstruction has a PSNR", "No PSNR [dB]: no whole episode was reconstructed"],
+    ),
+    "no training": (lambda results: results.update(training=[]), ["no training has a curve"]),
+    "no map": (
+        lambda results: [one.update(map=None) for one in results["rollouts"]],
+        ["no episode of heuristic, coverage, proposed has a map"],
+    ),
+    "a map less": (
+        lambda results: [one.update(map=None) for one in results["rollouts"] if one["method"] == "coverage"],
+        ["No map of coverage."],
+    ),
+    "no proposed": (without("rollouts", method="proposed"), ["No episode of proposed."]),
+    "a seed less": (without("reconstructions", method="surface", seed=1), ["Of fewer than 3 episodes"]),
+    "no whole ones": (without("reconstructions", whole=True), ["no whole episode was reconstructed"]),
+    "no visibility": (
+        lambda results: [one.update(visibility=None) for one in results["reconstructions"]],
+        ["Visibility and PSNR: no reconstruction has both"],
+    ),
+}
+
+
+@pytest.mark.parametrize("missing", INCOMPLETE)
+def test_what_cannot_be_made_is_left_out_with_its_reason(tmp_path, missing):
+    drop, words = INCOMPLETE[missing]
+    results = make_results(FEW, scenes=TRAIN_ONLY, starts=1, prefixes=(40,))
+    drop(results)
+    page = write_report(write_results(tmp_path, results, pictures=False)).read_text()
+    assert "### Cells that failed" in page
+    for part in [*words, "Table 3: unseen scenes, no retraining: no such scene", "no picture of a held-out view"]:
+        assert part in page
+    assert "nan" not in page
+    assert "None]" not in page
+
+
+def test_one_seed_has_no_intervals_and_no_lpips_is_said(tmp_path):
+    results = make_results(("heuristic", "proposed", "coverage"), seeds=1, starts=1, lpips=False)
+    page = write_report(write_results(tmp_path, results)).read_text()
+    table = (tmp_path / "table2.md").read_text()
+    assert "±" not in table
+    assert "LPIPS |" not in table
+    assert "No LPIPS: its weights are not there." in table
+    assert "one seed: no interval" in page
+    assert "nan" not in page
+
+
+def test_a_figure_of_before_does_not_outlive_its_data(tmp_path):
+    results = make_results(FEW, scenes=TRAIN_ONLY, starts=1)
+    write_report(write_results(tmp_path, results, pictures=False))
+    assert (tmp_path / "figure3.png").is_file()
+    results |= {"training": [], "rollouts": [], "reconstructions": []}
+    write_report(write_results(tmp_path, results, pictures=False))
+    assert not (tmp_path / "figure3.png").exists()
+
+
+def spoiled(folder, change):
+    value = make_results(FEW, scenes=TRAIN_ONLY, starts=1)
+    change(value)
+    (folder / "results.json").write_text(json.dumps(value))
+
+
+BAD = {
+    "no results": (lambda folder: None, 2, "expected the folder of an experiment"),
+    "not JSON": (lambda folder: (folder / "results.json").write_text("{"), 1, "results.json: expected JSON"),
+    "a list": (
+        lambda folder: (folder / "results.json").write_text("[]"),
+        1,
+        "expected results of format 1, found 'list'",
+    ),
+    "another format": (lambda folder: spoiled(folder, lambda v: v.update(format=2)), 1, "format 1, found 2"),
+    "no rollouts": (lambda folder: spoiled(folder, lambda v: v.pop("rollouts")), 1, "rollouts: missing or damaged"),
+    "half a rollout": (
+        lambda folder: spoiled(folder, lambda v: v["rollouts"][2].pop("metrics")),
+        1,
+        r"rollouts[2]: missing or damaged: KeyError('metrics')",
+    ),
+    "a text for a number": (
+        lambda folder: spoiled(folder, lambda v: v["reconstructions"][0].update(frames="many")),
+        1,
+        "reconstructions[0]: missing or damaged",
+    ),
+    "a damaged map": (
+        lambda folder: spoiled(folder, lambda v: v["rollouts"][0]["map"].update(floor="####")),
+        1,
+        "a map of the results cannot be read",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", BAD)
+def test_bad_input_is_one_line_that_names_it(tmp_path, capsys, fault):
+    spoil, code, words = BAD[fault]
+    spoil(tmp_path)
+    assert command.run(main, [str(tmp_path)]) == code
+    error = capsys.readouterr().err.strip()
+    assert words in error
+    assert len(error.splitlines()) == 1
+
+
+def test_an_unknown_method_of_the_maps_gets_the_nearest_name(tmp_path, capsys):
+    write_results(tmp_path, make_results(FEW, scenes=TRAIN_ONLY, starts=1), pictures=False)
+    assert command.run(main, [str(tmp_path), "--maps", "heuristik"]) == 2
+    assert "did you mean 'heuristic'?" in capsys.readouterr().err
+
+
+def test_the_command_stands_on_its_own(tmp_path):
+    line = [sys.executable, "-m", "experiment.report", "--help"]
+    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert "results.json" in done.stdout
+
+
+def test_every_method_has_a_look_of_its_own():
+    from experiment.look import look_of
+    from experiment.methods import METHODS as KNOWN
+
+    assert set(METHODS) <= set(KNOWN)
+    looks = [look_of(method) for method in KNOWN]
+    assert len(set(looks)) == len(looks)
+
+
+def with_floor(folder, numbers):
+    """A small rollout that has a floor."""
+    write_small_rollout(folder)
+    images.write_numbers(folder / "floor.png", numbers)
+    meta = json.loads((folder / "rollout.json").read_text())
+    meta["floor"] = {"file": "floor.png", "cell_m": 0.1, "origin_m": [1.0, -2.0], "shape": list(numbers.shape)}
+    (folder / "rollout.json").write_text(json.dumps(meta))
+    return folder
+
+
+def test_a_map_of_a_rollout_holds_its_floor_and_its_path(tmp_path):
+    numbers = np.array([[0, 1, 2], [3, 700, 0]], dtype=np.uint16)
+    folder = with_floor(tmp_path / "r", numbers)
+    add_yaw(folder / "steps.csv")
+    found = json.loads(json.dumps(floor_map(folder)))
+    np.testing.assert_array_equal(floor_of(found), numbers)
+    assert (found["cell_m"], found["origin_m"], found["shape"]) == (0.1, [1.0, -2.0], [2, 3])
+    rows = list(csv.DictReader((folder / "steps.csv").open()))
+    assert found["path"] == [pytest.approx([float(r["x_m"]), float(r["z_m"]), 0.25], abs=1e-4) for r in rows]
+
+
+def add_yaw(path):
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([f"{lines[0]},yaw_rad", *(f"{line},0.25" for line in lines[1:])]) + "\n")
+
+
+def test_a_rollout_without_a_floor_has_no_map(tmp_path):
+    assert floor_map(write_small_rollout(tmp_path / "r")) is None
+
+
+def test_a_table_of_steps_without_angles_is_named(tmp_path):
+    folder = with_floor(tmp_path / "r", np.ones((2, 2), dtype=np.uint16))
+    with pytest.raises(RolloutError, match=r"steps\.csv: expected x_m, z_m and yaw_rad"):
+        floor_map(folder)
+
+
+def test_a_folder_that_is_none_is_refused_by_the_function_too(tmp_path):
+    with pytest.raises(UsageError, match="expected the folder of an experiment"):
+        write_report(tmp_path / "none")
+    (tmp_path / "results.json").mkdir()
+    with pytest.raises(AVPError):
+        read_results(tmp_path)
