@@ -95,20 +95,29 @@ def _height_share(floor: np.ndarray) -> float:
 
 
 def _draw_map(axes: "Axes", rollout: Rollout, numbers: np.ndarray, last: int) -> Any:
+    from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
 
+    # Without its lightest part, which on white cannot be told from what is no floor.
+    shades = ListedColormap(colormaps["YlGnBu"](np.linspace(0.2, 1, 256)))
     assert rollout.floor is not None
     cell, (x, z), (rows, columns) = (rollout.floor[name] for name in ("cell_m", "origin_m", "shape"))
     extent = (x, x + columns * cell, z + rows * cell, z)
     base = np.ma.masked_where(numbers == NOT_NAVIGABLE, np.zeros(numbers.shape))
     axes.imshow(base, extent=extent, cmap=ListedColormap([_UNSEEN_COLOUR]), interpolation="nearest")
     seen = np.ma.masked_where(numbers <= NEVER, numbers.astype(float) - 1)
-    image = axes.imshow(seen, extent=extent, cmap="YlGnBu", vmin=1, vmax=last, interpolation="nearest")
+    image = axes.imshow(seen, extent=extent, cmap=shades, vmin=1, vmax=last, interpolation="nearest")
     path = np.array(rollout.floor["path"], dtype=np.float64).reshape(-1, 3)
     ahead = heading(path[:, 2])[:, [0, 2]]
     axes.plot(path[:, 0], path[:, 1], color="white", linewidth=3.2)
     axes.plot(path[:, 0], path[:, 1], color=_PATH_COLOUR, linewidth=1.6)
-    arrows: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1 / _ARROW_M, "width": 0.006}
+    arrows: dict[str, Any] = {
+        "angles": "xy",
+        "scale_units": "xy",
+        "scale": 1 / _ARROW_M,
+        "width": 0.0035,
+        "headwidth": 4,
+    }
     axes.quiver(path[:, 0], path[:, 1], ahead[:, 0], ahead[:, 1], color="black", zorder=4, **arrows)
     for place, colour in ((path[0], "white"), (path[-1], _PATH_COLOUR)):
         axes.plot(*place[:2], "o", color=colour, markeredgecolor="black", markersize=6, zorder=5)
