@@ -52,10 +52,10 @@ PRESETS = {
     ),
     "cpu": Preset(
         seeds=3,
-        starts=2,
+        starts=1,
         observation="map",
         steps=700_000,
-        steps_rooms=1_400_000,
+        steps_rooms=700_000,
         rooms=16,
         size=(192, 144),
         reconstruction="avp-nerfacto",
