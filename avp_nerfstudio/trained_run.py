@@ -4,6 +4,7 @@ nerfstudio keeps its settings as YAML that names Python objects, which reading i
 a program, so open only those of your own trainings. The checkpoint beside it is read with torch's safe loader.
 """
 
+import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,15 +34,32 @@ class TrainedRun:
 
 
 def config_path(path: Path) -> Path:
-    """The config.yml that a path means: itself, or that inside a training's folder.
+    """The config.yml that a path means: itself, or that inside a training's or a reconstruction's folder.
 
     Raises:
         TrainedRunError: there is none.
     """
-    path = path / "config.yml" if path.is_dir() else path
+    if path.is_dir():
+        inside = path / "config.yml"
+        path = inside if inside.is_file() else path / (_kept_by_reconstruction(path) or inside.name)
     if not path.is_file():
         raise TrainedRunError(f"{path}: expected the config.yml that ns-train wrote, found none")
     return path
+
+
+def _kept_by_reconstruction(folder: Path) -> str | None:
+    """Where `avp_nerfstudio.reconstruct --keep-checkpoint` left the config within its folder.
+
+    Raises:
+        TrainedRunError: the folder is a reconstruction's that has kept none.
+    """
+    try:
+        config = json.loads((folder / "scores.json").read_text(encoding="utf-8")).get("config")
+    except (OSError, ValueError, AttributeError):
+        return None
+    if not isinstance(config, str) or not (folder / config).resolve().is_relative_to(folder.resolve()):
+        raise TrainedRunError(f"{folder}: kept no checkpoint; reconstruct with --keep-checkpoint to open it again")
+    return config
 
 
 def read_config(path: Path) -> Any:

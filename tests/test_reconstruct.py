@@ -18,6 +18,7 @@ from avp_habitat.rollout import read_rollout
 from avp_habitat.rollout_visibility import visibility_of
 from avp_nerfstudio import reconstruct
 from avp_nerfstudio.reconstruct import Request
+from avp_nerfstudio.trained_run import TrainedRunError, config_path
 
 ITERATIONS = ("--iterations", "3")
 
@@ -98,6 +99,10 @@ def test_a_kept_checkpoint_opens_where_the_folder_is_and_scores_the_same(room, t
     out = tmp_path / "out"
     assert run(room, "--out", out, *ITERATIONS, "--keep-checkpoint") == 0
     found = scores_of(out)
+    assert config_path(out) == out / found["config"]
+    (out / "scores.json").write_text(json.dumps(found | {"config": "../elsewhere.yml"}))
+    with pytest.raises(TrainedRunError, match="kept no checkpoint"):
+        config_path(out)
     from nerfstudio.scripts.eval import ComputePSNR
 
     monkeypatch.chdir(tmp_path)

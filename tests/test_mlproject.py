@@ -1,0 +1,64 @@
+import importlib
+import re
+import runpy
+import shlex
+import sys
+from pathlib import Path
+
+import mlflow.projects
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+PROJECT = yaml.safe_load((ROOT / "MLproject").read_text(encoding="utf-8"))
+POINTS = PROJECT["entry_points"]
+
+
+def words_of(name):
+    """The command line of an entry point with its defaults, as MLflow puts it together."""
+    point = POINTS[name]
+    defaults = {key: value["default"] for key, value in point.get("parameters", {}).items()}
+    return shlex.split(point["command"].format(**defaults))
+
+
+def options_of(words):
+    """What the command's own parser makes of a command line."""
+    assert words[0] == "python"
+    if words[1] == "-m":
+        return importlib.import_module(words[2])._parser().parse_args(words[3:])
+    return runpy.run_path(str(ROOT / words[1]))["_parser"]().parse_args(words[2:])
+
+
+def test_the_project_has_the_entry_points_that_its_page_shows():
+    page = (ROOT / "docs" / "experiment.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"mlflow run \. -e (\w+)", page)) == set(POINTS)
+
+
+def test_it_uses_the_environment_that_is_there():
+    assert not {"conda_env", "docker_env", "python_env"} & set(PROJECT)
+
+
+@pytest.mark.parametrize("name", POINTS)
+def test_each_entry_point_is_a_command_that_takes_its_parameters(name):
+    options = vars(options_of(words_of(name)))
+    for parameter in POINTS[name]["parameters"]:
+        assert parameter in options or parameter in {"reconstruction"}, parameter
+
+
+@pytest.mark.parametrize("name", POINTS)
+def test_the_page_names_parameters_that_exist(name):
+    page = (ROOT / "docs" / "experiment.md").read_text(encoding="utf-8")
+    for line in re.findall(rf"mlflow run \. -e {name} (.*)", page):
+        assert set(re.findall(r"-P (\w+)=", line)) <= set(POINTS[name]["parameters"])
+
+
+def test_a_user_mistake_ends_mlflow_run_with_the_commands_one_line(tmp_path, monkeypatch, capfd):
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlflow.db")
+    monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=":")
+    with pytest.raises(mlflow.exceptions.ExecutionException):
+        mlflow.projects.run(str(ROOT), "compare", parameters={"preset": "cpuu", "out": str(tmp_path / "e")},
+                            env_manager="local")  # fmt: skip
+    errors = capfd.readouterr().err
+    assert "error: unknown preset 'cpuu'" in errors
+    assert "did you mean 'cpu'?" in errors
+    assert not (tmp_path / "e").exists()
