@@ -2,8 +2,6 @@
 
 import csv
 import json
-import os
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -13,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat import images
-from avp_habitat.errors import RolloutError, UsageError
+from avp_habitat.errors import RolloutError
+from avp_habitat.new_folder import NewFolder
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout import FORMAT, FORMAT_VERSION, HELDOUT, POSE_CONVENTION, View, frame_name
 
@@ -35,33 +34,28 @@ class RolloutWriter:
             UsageError: the folder exists.
             RolloutError: its parent cannot be written.
         """
-        self.folder = Path(folder)
         self.intrinsics = intrinsics
-        self._temporary = self.folder.parent / f".{self.folder.name}.partial-{os.getpid()}"
+        self._new = NewFolder(folder, failure=RolloutError)
+        self.folder = self._new.folder
         self._poses: dict[str, list[NDArray[np.float64]]] = {"": [], HELDOUT: []}
         self._steps: list[dict[str, Any]] = []
-        if self.folder.exists() or self.folder.is_symlink():
-            raise UsageError(f"--out {self.folder}: exists already; choose another name or remove it")
 
     def __enter__(self) -> "RolloutWriter":
         """Make the temporary folder."""
+        self._new.__enter__()
         try:
-            self._temporary.mkdir(parents=True)
-            for base in (self._temporary, self._temporary / HELDOUT):
+            for base in ("", HELDOUT):
                 for kind in ("images", "depth", "poses"):
-                    (base / kind).mkdir(parents=True)
+                    (self.path(base) / kind).mkdir(parents=True)
         except OSError as error:
-            self._discard()
-            raise self._unwritable(error) from None
+            self._new.__exit__(type(error), error, None)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Remove what was not published; report a full or failing disk as such."""
-        self._discard()
-        if isinstance(error, OSError):
-            raise self._unwritable(error) from error
+        self._new.__exit__(kind, error, trace)
 
     def add_frame(self, rgb: NDArray[np.uint8], depth: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
         """Write the next captured frame: `(h, w, 3)` uint8, `(h, w)` metres, `(4, 4)` habitat camera_to_world."""
@@ -78,13 +72,13 @@ class RolloutWriter:
     def views(self, *, heldout: bool) -> list[View]:
         """The captured frames, or the held-out views, that were written so far."""
         base = HELDOUT if heldout else ""
-        images, depths = self._temporary / base / "images", self._temporary / base / "depth"
+        images, depths = self.path(base) / "images", self.path(base) / "depth"
         names = [f"{frame_name(index)}.png" for index in range(len(self._poses[base]))]
         return [View(images / n, depths / n, pose) for n, pose in zip(names, self._poses[base], strict=True)]
 
     def path(self, name: str) -> Path:
         """Where to write a further file of the folder."""
-        return self._temporary / name
+        return self._new.path(name)
 
     def publish(self, meta: Mapping[str, Any]) -> Path:
         """Write the tables, then give the folder its final name.
@@ -98,22 +92,14 @@ class RolloutWriter:
         self._write_steps()
         self._write_json("transforms.json", self._transforms())
         self._write_json("rollout.json", self._rollout(meta))
-        try:
-            self._temporary.rename(self.folder)
-        except OSError:
-            if self.folder.exists():
-                raise UsageError(
-                    f"--out {self.folder}: another program made it meanwhile; nothing was replaced"
-                ) from None
-            raise
-        return self.folder
+        return self._new.publish()
 
     def _add(self, base: str, rgb: NDArray[np.uint8], depth: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
         stem = frame_name(len(self._poses[base]))
-        images.write_rgb(self._temporary / base / "images" / f"{stem}.png", rgb)
-        images.write_depth(self._temporary / base / "depth" / f"{stem}.png", depth)
+        images.write_rgb(self.path(base) / "images" / f"{stem}.png", rgb)
+        images.write_depth(self.path(base) / "depth" / f"{stem}.png", depth)
         rows = "\n".join(" ".join(f"{value:.9f}" for value in row) for row in pose)
-        (self._temporary / base / "poses" / f"{stem}.txt").write_text(rows + "\n", encoding="ascii")
+        (self.path(base) / "poses" / f"{stem}.txt").write_text(rows + "\n", encoding="ascii")
         self._poses[base].append(np.asarray(pose, dtype=np.float64))
 
     def _rollout(self, meta: Mapping[str, Any]) -> dict[str, Any]:
@@ -174,9 +160,3 @@ class RolloutWriter:
     def _write_json(self, name: str, value: Mapping[str, Any]) -> None:
         text = json.dumps(value, indent=2, allow_nan=False)
         self.path(name).write_text(text + "\n", encoding="utf-8")
-
-    def _discard(self) -> None:
-        shutil.rmtree(self._temporary, ignore_errors=True)
-
-    def _unwritable(self, error: OSError) -> RolloutError:
-        return RolloutError(f"--out {self.folder}: cannot write there: {error.strerror or error}")

@@ -15,10 +15,10 @@ from typing import Any
 
 from avp_habitat import command
 from avp_habitat.errors import RolloutError, UsageError, unknown_name
+from avp_habitat.new_folder import NewFolder
 from avp_habitat.rollout import Rollout, read_rollout
 from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, address_of
 from avp_habitat.tracking.early import open_store
-from avp_nerfstudio.reconstruct_folder import ReconstructionFolder
 
 METHODS = ("avp-nerfacto", "nerfacto")
 SEED = 42
@@ -62,7 +62,7 @@ def reconstruct(request: Request) -> dict[str, Any]:
     """
     started = time.monotonic()
     _check_options(request)
-    with ReconstructionFolder(request.out) as folder:
+    with NewFolder(request.out) as folder:
         rollout = read_rollout(request.rollout)
         _check_rollout(request, rollout)
         if request.mlflow:

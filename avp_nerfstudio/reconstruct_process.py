@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import math
 import random
 import shutil
@@ -23,6 +24,7 @@ from tqdm import tqdm
 
 from avp_habitat.command import INTERRUPTED
 from avp_habitat.images import write_rgb
+from avp_habitat.new_folder import NewFolder
 from avp_habitat.provenance import git_commit
 from avp_habitat.rollout import Rollout
 from avp_habitat.rollout_visibility import visibility_of
@@ -32,7 +34,6 @@ from avp_nerfstudio.hash_encoding import compile_hash_encodings
 from avp_nerfstudio.heldout_pictures import to_8_bit
 from avp_nerfstudio.heldout_views import HeldoutView, heldout_count, mean_scores, render_views
 from avp_nerfstudio.lpips import optional_lpips
-from avp_nerfstudio.reconstruct_folder import ReconstructionFolder
 from avp_nerfstudio.reconstruct_settings import configure
 from avp_nerfstudio.tracking_facts import facts_of
 from avp_nerfstudio.tracking_mlflow import open_again
@@ -43,11 +44,12 @@ if TYPE_CHECKING:
 
 FORMAT = "avp-reconstruction"
 FORMAT_VERSION = 1
+SCORES = "scores.json"
 _OUTPUTS = "nerfstudio"
 _PACKAGES = ("avp-suite", "nerfstudio", "torch", "torchvision", "torchmetrics", "numpy", "numba", "tinycudann")
 
 
-def process(request: "Request", rollout: Rollout, folder: ReconstructionFolder, *, started: float) -> dict[str, Any]:
+def process(request: "Request", rollout: Rollout, folder: NewFolder, *, started: float) -> dict[str, Any]:
     """Train, score, and write everything of the folder.
 
     Args:
@@ -100,7 +102,7 @@ def process(request: "Request", rollout: Rollout, folder: ReconstructionFolder, 
         found["config"] = str(_keep(config, folder).relative_to(folder.path("").resolve()))
     else:
         shutil.rmtree(folder.path(_OUTPUTS))
-    folder.write_scores(found)
+    folder.path(SCORES).write_text(json.dumps(found, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     if request.mlflow:
         _track(request.mlflow, config, folder, found)
     return found
@@ -137,7 +139,7 @@ def _train(trainer: Any) -> None:
         progress.close()
 
 
-def _score(pipeline: Any, folder: ReconstructionFolder, pictures: Sequence[int]) -> list[tuple[str, dict[str, float]]]:
+def _score(pipeline: Any, folder: NewFolder, pictures: Sequence[int]) -> list[tuple[str, dict[str, float]]]:
     """Name and scores of each held-out view."""
     pipeline.eval()
     # What ns-eval has after loading a checkpoint, which does not hold how far a short training has annealed.
@@ -171,7 +173,7 @@ def _visibility(rollout: Rollout, frames: int) -> dict[str, Any]:
     return {**seen.figures(), "per_view": per_view}
 
 
-def _keep(config: Any, folder: ReconstructionFolder) -> Path:
+def _keep(config: Any, folder: NewFolder) -> Path:
     """Write `config.yml` as it is to be read where the folder goes; gives its present path."""
     path = config.get_base_dir() / "config.yml"
     config.output_dir = (folder.folder / _OUTPUTS).resolve()
@@ -179,7 +181,7 @@ def _keep(config: Any, folder: ReconstructionFolder) -> Path:
     return path
 
 
-def _track(address: str, config: Any, folder: ReconstructionFolder, found: Mapping[str, Any]) -> None:
+def _track(address: str, config: Any, folder: NewFolder, found: Mapping[str, Any]) -> None:
     """Log settings and scores; a store that fails is a warning, because the scores are there."""
     try:
         run, _ = open_again(address, facts_of(config), folder=folder.path(""))

@@ -1,36 +1,36 @@
-"""The folder of a reconstruction, written so that it exists only when it is whole."""
+"""A folder of results that exists only when it is whole."""
 
-import json
 import os
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 from avp_habitat.errors import AVPError, UsageError
 
-SCORES = "scores.json"
 
-
-class ReconstructionFolder:
-    """A context that writes to a temporary folder, renamed to its final name by `publish`.
+class NewFolder:
+    """A context that makes a temporary folder, renamed to its final name by `publish`.
 
     Leaving the context without `publish` (an error, Ctrl-C) removes the temporary folder.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: str | Path, *, failure: type[AVPError] = AVPError) -> None:
         """Reserve a folder.
 
-        Raises:
-            UsageError: it exists.
-        """
-        self.folder = folder
-        self._temporary = folder.parent / f".{folder.name}.partial-{os.getpid()}"
-        if folder.exists() or folder.is_symlink():
-            raise UsageError(f"--out {folder}: exists already; choose another name or remove it")
+        Args:
+            folder: the final name; must not exist.
+            failure: what is raised where nothing can be written.
 
-    def __enter__(self) -> "ReconstructionFolder":
+        Raises:
+            UsageError: the folder exists.
+        """
+        self.folder = Path(folder)
+        self._failure = failure
+        self._temporary = self.folder.parent / f".{self.folder.name}.partial-{os.getpid()}"
+        if self.folder.exists() or self.folder.is_symlink():
+            raise UsageError(f"--out {self.folder}: exists already; choose another name or remove it")
+
+    def __enter__(self) -> "NewFolder":
         """Make the temporary folder."""
         try:
             self._temporary.mkdir(parents=True)
@@ -50,11 +50,7 @@ class ReconstructionFolder:
         """Where to write a file or folder of it now."""
         return self._temporary / name
 
-    def write_scores(self, scores: Mapping[str, Any]) -> None:
-        """Write `scores.json`."""
-        self.path(SCORES).write_text(json.dumps(scores, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-
-    def publish(self) -> None:
+    def publish(self) -> Path:
         """Give the folder its final name.
 
         Raises:
@@ -68,6 +64,7 @@ class ReconstructionFolder:
                     f"--out {self.folder}: another program made it meanwhile; nothing was replaced"
                 ) from None
             raise
+        return self.folder
 
     def _unwritable(self, error: OSError) -> AVPError:
-        return AVPError(f"--out {self.folder}: cannot write there: {error.strerror or error}")
+        return self._failure(f"--out {self.folder}: cannot write there: {error.strerror or error}")
