@@ -1,6 +1,6 @@
 """What `rl_zoo3 train --conf-file avp_sb3.hyperparams` trains with: Table 4 of the paper, stepped as one batch.
 
-The three rewards share these values; choose one by `--env-kwargs reward:"'coverage'"`. rl_zoo3 sets the device by
+The rewards share these values; choose one by `--env-kwargs reward:"'coverage'"`. rl_zoo3 sets the device by
 `--device cpu`. PPO's buffer is `n_envs` times `n_steps`: change both together, for example `-params n_envs:4
 n_steps:512`. To train in several rooms:
 `-params vec_env_wrapper:"{'avp_sb3.zoo.Batched': {'scenes': ['builtin:1', 'builtin:2']}}"`.
