@@ -4,6 +4,19 @@ import platform
 from collections.abc import Iterable
 from importlib import metadata
 
+PACKAGES = (
+    "avp-suite",
+    "stable-baselines3",
+    "nerfstudio",
+    "torch",
+    "gymnasium",
+    "numpy",
+    "open3d",
+    "mlflow",
+    "rerun-sdk",
+)
+"""The suite, and what its results depend on most."""
+
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
     """Version by name, of `python` first and then of those of the packages that are installed."""

@@ -9,8 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from avp_habitat.tracking.context import PACKAGES
-from avp_habitat.versions import installed_versions
+from avp_habitat.versions import PACKAGES, installed_versions
 from experiment.cells import COLLECT, RECONSTRUCT, TRAIN, Cell
 from experiment.configuration import Configuration
 from experiment.floor_map import floor_map

@@ -8,19 +8,8 @@ from mlflow.tracking.context.abstract_context import RunContextProvider
 
 from avp_habitat.provenance import git_commit
 from avp_habitat.simulators import open_scenes
-from avp_habitat.versions import installed_versions
+from avp_habitat.versions import PACKAGES, installed_versions
 
-PACKAGES = (
-    "avp-suite",
-    "stable-baselines3",
-    "nerfstudio",
-    "torch",
-    "gymnasium",
-    "numpy",
-    "open3d",
-    "mlflow",
-    "rerun-sdk",
-)
 _USERS = ("avp_habitat.env", "avp_sb3", "avp_nerfstudio")
 _MAX_TAG = 5000
 
