@@ -1,4 +1,4 @@
-"""The figures that are pictures of the scene: top-down maps of episodes, and a held-out view with its renders."""
+"""The figures that are pictures of the scene: top-down maps of episodes, and held-out views with their renders."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,11 +19,13 @@ if TYPE_CHECKING:
 
 DEFAULT_MAPS = ("heuristic", "coverage", "proposed")
 """Methods of figure 5."""
+DEFAULT_RENDERS = ("heuristic", "oracle", "coverage", "proposed", "surface")
+"""Methods of figure 6, as far as they are there; else the first ones."""
 PICTURES = "pictures"
 _ARROW_M = 0.22
 _UNSEEN_COLOUR, _OUTSIDE_COLOUR = "#C9CCD2", "#FFFFFF"
 _PATH_COLOUR = "#B22234"
-_COLUMNS = 4
+_COLUMNS = 5
 
 
 def maps(results: Results, methods: Sequence[str] = DEFAULT_MAPS) -> Made:
@@ -63,31 +65,34 @@ def maps(results: Results, methods: Sequence[str] = DEFAULT_MAPS) -> Made:
     return Made(picture, caption + note)
 
 
-def same_view(results: Results, role: str) -> Made:
-    """Figure 6: a held-out view and its renders from every method's reconstruction, with its PSNR below each."""
+def same_views(results: Results, role: str) -> Made:
+    """Figure 6: held-out views and what the reconstructions of some methods make of them, each with its PSNR."""
     scenes = results.scenes(role)
     if not scenes:
         raise Missing(f"no scene of role {role}")
     scene = scenes[0]
-    number, found = _most_pictures(results, scene)
-    panels_of = [("truth", found.pop("truth")), *found.items()]
-    first = read_rgb(panels_of[0][1])
-    rows = -(-len(panels_of) // _COLUMNS)
-    height = WIDTH_IN / _COLUMNS * first.shape[0] / first.shape[1] + 0.4
-    picture = new_figure(height * rows)
-    panels = picture.subplots(rows, _COLUMNS, squeeze=False).ravel()
-    scores = _view_scores(results, scene, number)
-    for axes in panels:
-        axes.set_axis_off()
-    for axes, (name, path) in zip(panels, panels_of, strict=False):
-        axes.imshow(_picture(path), interpolation="nearest")
-        psnr = scores.get(name)
-        axes.set_title(name if psnr is None else f"{name}: {psnr:.1f} dB", fontsize=10)
+    found = _pictures_by_view(results, scene)
+    there = [method for method in results.methods if any(method in named for named in found.values())]
+    columns = ["truth", *([method for method in DEFAULT_RENDERS if method in there] or there)[:_COLUMNS]]
+    first = read_rgb(next(iter(found.values()))["truth"])
+    height = WIDTH_IN / len(columns) * first.shape[0] / first.shape[1] + 0.3
+    picture = new_figure(min(11.0, height * len(found) + 0.2))
+    panels = picture.subplots(len(found), len(columns), squeeze=False)
+    for line, (row, (number, named)) in enumerate(zip(panels, found.items(), strict=True)):
+        scores = _view_scores(results, scene, number)
+        for axes, name in zip(row, columns, strict=True):
+            axes.set_axis_off()
+            head = f"{name}\n" if line == 0 else ""
+            psnr = f"{scores[name]:.1f} dB" if name in scores else f"view {number}" if name == "truth" else ""
+            axes.set_title(head + psnr, fontsize=9)
+            if name in named:
+                axes.imshow(_picture(named[name]), interpolation="nearest")
+    left_out = [method for method in there if method not in columns]
     caption = (
-        f"Held-out view {number} of {scene}: truth, and renders from the reconstructions of whole episodes (seed 0, "
-        "first start), each with this view's PSNR."
+        f"Held-out views {', '.join(map(str, found))} of {scene}: truth, and renders from the reconstructions of whole "
+        "episodes (seed 0, first start), each with this view's PSNR."
     )
-    return Made(picture, caption)
+    return Made(picture, caption + (f" Not shown: {', '.join(left_out)}." if left_out else ""))
 
 
 def _height_share(floor: np.ndarray) -> float:
@@ -130,8 +135,8 @@ def _draw_map(axes: "Axes", rollout: Rollout, numbers: np.ndarray, last: int) ->
     return image
 
 
-def _most_pictures(results: Results, scene: str) -> tuple[int, dict[str, Path]]:
-    """The held-out view that most methods have a render of, and its pictures: the truth, then methods in order."""
+def _pictures_by_view(results: Results, scene: str) -> dict[int, dict[str, Path]]:
+    """Held-out views that have a render, by number: the truth's file, then those of methods in order."""
     slug = Path(scene).stem.replace(":", "_")
     found: dict[int, dict[str, Path]] = {}
     for truth in sorted((results.folder / PICTURES).glob(f"{slug}-truth-*.png")):
@@ -145,8 +150,7 @@ def _most_pictures(results: Results, scene: str) -> tuple[int, dict[str, Path]]:
             found[int(number)] = named
     if not found:
         raise Missing(f"no picture of a held-out view of {scene} with a render of it in {PICTURES}/")
-    best = max(found, key=lambda number: (len(found[number]), -number))
-    return best, found[best]
+    return dict(sorted(found.items()))
 
 
 def _view_scores(results: Results, scene: str, number: int) -> dict[str, float]:

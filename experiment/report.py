@@ -23,7 +23,7 @@ from experiment.figures import (
     reward_while_training,
     visibility_and_psnr,
 )
-from experiment.figures_top_down import DEFAULT_MAPS, maps, same_view
+from experiment.figures_top_down import DEFAULT_MAPS, maps, same_views
 from experiment.look import save
 from experiment.stored import FILE, TRAIN, UNSEEN, Results, read_results
 from experiment.tables import make_table
@@ -83,8 +83,8 @@ def _figures(shown_maps: Sequence[str]) -> dict[str, tuple[str, Callable[[Result
         "figure3": ("Figure 3: coverage per view while training", cpv_while_training),
         "figure4": ("Figure 4: mean reward while training", reward_while_training),
         "figure5": ("Figure 5: episodes from above", partial(maps, methods=shown_maps)),
-        "figure6": ("Figure 6: the same held-out view", partial(same_view, role=TRAIN)),
-        "figure6_unseen": ("Figure 6, unseen scene", partial(same_view, role=UNSEEN)),
+        "figure6": ("Figure 6: the same held-out views", partial(same_views, role=TRAIN)),
+        "figure6_unseen": ("Figure 6, unseen scene", partial(same_views, role=UNSEEN)),
         "psnr_by_views": ("PSNR by views", psnr_by_views),
         "visibility": ("Visibility and PSNR", visibility_and_psnr),
     }
