@@ -34,10 +34,11 @@ METHODS = {
     for reward in REWARD_NAMES
 }  # fmt: skip
 """By name."""
-PAPER = ("heuristic", "random", "frontier", "greedy", "oracle", *REWARD_NAMES)
-"""What is compared by default, in the tables' order: the baselines, then every reward."""
-DEFAULT = (*PAPER, *(f"{reward}{ROOMS}" for reward in ("proposed", "surface") if reward in REWARD_NAMES))
-"""The same, and the rewards with a learned stop trained over many rooms."""
+BASELINES = ("heuristic", "random", "frontier", "greedy", "oracle", "survey")
+"""What learned policies are compared with by default; the last two plan with full knowledge, for floor and for all
+surfaces."""
+DEFAULT = (*BASELINES, *REWARD_NAMES, f"proposed{ROOMS}", f"surface{ROOMS}")
+"""The baselines, every reward, and the rewards with a learned stop trained over many rooms."""
 
 
 def chosen_methods(names: Iterable[str]) -> tuple[Method, ...]:
