@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 DEFAULT_MAPS = ("heuristic", "coverage", "proposed")
 """Methods of figure 5."""
-DEFAULT_RENDERS = ("heuristic", "oracle", "coverage", "proposed", "surface")
+DEFAULT_RENDERS = ("heuristic", "survey", "coverage", "proposed", "surface")
 """Methods of figure 6, as far as they are there; else the first ones."""
 PICTURES = "pictures"
 _ARROW_M = 0.22
