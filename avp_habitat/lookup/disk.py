@@ -6,6 +6,7 @@ import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +57,8 @@ class TileFiles:
             # Another process may write the same tile: each writes its own file, and the last rename wins.
             with tempfile.NamedTemporaryFile(dir=self._folder, suffix=".part", delete=False) as file:
                 try:
-                    np.savez(file, allow_pickle=False, points=points, **columns)
+                    arrays: dict[str, Any] = {"points": points, **columns}
+                    np.savez(file, **arrays)
                     file.close()
                     os.replace(file.name, self._path(self._folder, tile))
                 except BaseException:
