@@ -4,7 +4,6 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from avp_habitat.rewards import has_stop
 from experiment.configuration import Configuration, Scene
 from experiment.methods import Method
 
@@ -151,8 +150,3 @@ def _reconstruction(configuration: Configuration, root: Path, rollout: Cell, fra
         frames,
         rollout,
     )
-
-
-def stops_early(cell: Cell) -> bool:
-    """Whether a rollout may have fewer views than the budget."""
-    return cell.method.learned and has_stop(cell.method.reward)

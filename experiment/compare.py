@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
@@ -20,6 +21,9 @@ from experiment.methods import DEFAULT, METHODS, chosen_methods
 from experiment.presets import PRESETS, preset_named
 from experiment.runner import PRELOAD, Runner, default_jobs
 from experiment.store import Store, bytes_needed
+
+if TYPE_CHECKING:
+    from experiment.tracking import Parent
 
 AUTO = "auto"
 NONE = "none"
@@ -142,13 +146,12 @@ def run(options: Options, line: str) -> None:
         )
 
 
-def write_report(options: Options, store: Store, cells: Sequence[Cell], line: str, parent: object) -> None:
+def write_report(options: Options, store: Store, cells: Sequence[Cell], line: str, parent: "Parent") -> None:
     """Gather what was found; tables and figures from it; all of it into MLflow."""
     from experiment.report import write_report as tables_and_figures
     from experiment.results import copy_pictures, gather, write
-    from experiment.tracking import Parent, log_results
+    from experiment.tracking import log_results
 
-    assert isinstance(parent, Parent)
     hours = sum(record["seconds"] for cell in cells if (record := store.record(cell))) / 3600
     results = gather(options.configuration, store, cells, command=line, hours=hours)
     copy_pictures(store, cells)

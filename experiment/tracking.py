@@ -9,7 +9,7 @@ from typing import Any
 
 from avp_habitat.intervals import mean_and_half_width
 from avp_habitat.provenance import flat
-from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, TrackingError, absolute, connect
+from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, absolute, connect
 from avp_habitat.tracking.comparison import METHOD_TAG, POLICY_TAG, SCENE_TAG
 from avp_habitat.tracking.opening import NewRun, join_run, start_run
 from avp_habitat.tracking.remote import PARENT_TAG, existing_run, find_run
@@ -30,8 +30,6 @@ class Parent:
     """Where the tables go."""
     experiment: str
     """Name of its MLflow experiment, in which the trainings are made too."""
-    owned: bool
-    """Whether it was begun here, and not by `mlflow run`."""
 
     def close(self, status: Status) -> None:
         """End it; one of `mlflow run` gets its end from there."""
@@ -54,9 +52,9 @@ def open_parent(name: str) -> Parent:
         client = connect(address)
         identity = existing_run(client, begun).info.experiment_id
         client.set_tag(begun, KIND_TAG, KIND)
-        return Parent(join_run(address, begun), client.get_experiment(identity).name, owned=False)
+        return Parent(join_run(address, begun), client.get_experiment(identity).name)
     run = start_run(address, NewRun(experiment=EXPERIMENT, name=name, tags={KIND_TAG: KIND}))
-    return Parent(run, EXPERIMENT, owned=True)
+    return Parent(run, EXPERIMENT)
 
 
 def log_results(parent: Parent, results: dict[str, Any], folder: Path) -> None:
@@ -127,6 +125,3 @@ def _adopt(run: TrackedRun, trainings: Iterable[str | None]) -> None:
     for run_id in trainings:
         if run_id is not None and find_run(client, run_id) is not None:
             client.set_tag(run_id, PARENT_TAG, run.run_id)
-
-
-__all__ = ["EXPERIMENT", "Parent", "TrackingError", "log_results", "open_parent", "tracking_uri"]
