@@ -2,6 +2,7 @@ import importlib
 import re
 import runpy
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 
@@ -62,3 +63,12 @@ def test_a_user_mistake_ends_mlflow_run_with_the_commands_one_line(tmp_path, mon
     assert "error: unknown preset 'cpuu'" in errors
     assert "did you mean 'cpu'?" in errors
     assert not (tmp_path / "e").exists()
+
+
+def test_a_python_without_the_packages_is_told_in_one_line():
+    # -S leaves site-packages out, as the `python` of a path without the environment does.
+    words = [sys.executable, "-S", "-m", "experiment.compare", "--preset", "smoke"]
+    answer = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+    assert answer.returncode == 1
+    assert answer.stderr.strip().endswith("first: source .venv/bin/activate")
+    assert len(answer.stderr.strip().splitlines()) == 1
