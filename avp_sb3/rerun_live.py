@@ -23,7 +23,7 @@ from avp_sb3.rerun_relay import Relay
 VIEWER, WEB = "viewer", "web"
 _LOOPBACK, _PORT, _WEB_PORT = "127.0.0.1", 9876, 9090
 _MEMORY = "1GiB"
-_START_S, _CONNECT_S, _ANSWER_S, _PATIENCE_S, _STAYS_S = 30.0, 5.0, 5.0, 5.0, 0.5
+_START_S, _CONNECT_S, _ANSWER_S, _PATIENCE_S, _STAYS_S = 30.0, 5.0, 15.0, 5.0, 0.5
 
 
 class LiveError(AVPError):
@@ -85,9 +85,10 @@ class LiveViewer:
             self._recording.connect_grpc(
                 f"rerun+http://{_LOOPBACK}:{self._relay.port}/proxy", default_blueprint=blueprint
             )
+            # A flush returns as soon as its bytes are sent, also to somebody who does not understand them.
             self._recording.flush(timeout_sec=_ANSWER_S)
-            if self._relay.lost:
-                raise RuntimeError("it ended the connection")
+            if not self._relay.speaks_http2(_ANSWER_S):
+                raise RuntimeError("it ended the connection" if self._relay.lost else "it does not answer with HTTP/2")
         except (RuntimeError, ValueError) as error:
             self.finish()
             raise LiveError(f"{self._target}: what listens there is no Rerun viewer ({error})") from None

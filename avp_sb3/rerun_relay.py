@@ -6,6 +6,7 @@ import time
 from contextlib import suppress
 
 _PART = 1 << 16
+_SETTINGS_FRAME, _FRAME_TYPE_AT = 4, 3
 
 
 class Relay:
@@ -32,6 +33,8 @@ class Relay:
         self._patience_s = patience_s
         self._blocked_since: float | None = None
         self._cut = False
+        self._answered = threading.Event()
+        self._greeting = b""
         self._near: socket.socket | None = None
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
@@ -43,9 +46,22 @@ class Relay:
         since = self._blocked_since
         return self._cut or (since is not None and time.monotonic() - since > self._patience_s)
 
+    def speaks_http2(self, timeout_s: float) -> bool:
+        """Whether the other side answers as every gRPC server does: with a SETTINGS frame first (RFC 9113, 3.4).
+
+        Args:
+            timeout_s: how long to wait for its first bytes, seconds.
+
+        Returns:
+            False also for a side that says nothing in that time, or ends the connection.
+        """
+        self._answered.wait(timeout_s)
+        return self._greeting[_FRAME_TYPE_AT:] == bytes([_SETTINGS_FRAME])
+
     def cut(self) -> None:
         """End both connections at once."""
         self._cut = True
+        self._answered.set()
         for connection in (self._listener, self._near, self._far):
             if connection is not None:
                 with suppress(OSError):
@@ -64,7 +80,14 @@ class Relay:
             while part := source.recv(_PART):
                 if target is self._far:
                     self._blocked_since = time.monotonic()
+                elif not self._answered.is_set():
+                    self._greet(part)
                 target.sendall(part)
                 if target is self._far:
                     self._blocked_since = None
         self.cut()
+
+    def _greet(self, part: bytes) -> None:
+        self._greeting = (self._greeting + part)[: _FRAME_TYPE_AT + 1]
+        if len(self._greeting) > _FRAME_TYPE_AT:
+            self._answered.set()

@@ -203,18 +203,31 @@ def test_an_address_where_nobody_listens_is_an_error_at_the_start(tmp_path):
         ppo().learn(64, callback=RerunCallback(tmp_path / "a.rrd", live=address(port)))
 
 
-def test_an_address_where_something_else_listens_is_an_error_at_the_start():
+@pytest.mark.parametrize("delay_s", [0, 0.2])
+def test_an_address_where_something_else_listens_is_an_error_at_the_start(delay_s):
+    """Also when it reads first: Rerun has flushed what it had to send by then, and sees nothing wrong."""
     with socket.create_server(("127.0.0.1", 0)) as other:
         viewer = LiveViewer(address(other.getsockname()[1]))
         other.settimeout(60)
 
         def answer():
             connection, _ = other.accept()
+            if delay_s:
+                connection.recv(1 << 16)
+                time.sleep(delay_s)
             connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
             connection.close()
 
         threading.Thread(target=answer, daemon=True).start()
         with pytest.raises(LiveError, match="what listens there is no Rerun viewer"):
+            viewer.open("some", rrb.Blueprint())
+
+
+def test_an_address_where_somebody_listens_and_says_nothing_is_an_error_at_the_start(monkeypatch):
+    monkeypatch.setattr("avp_sb3.rerun_live._ANSWER_S", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        viewer = LiveViewer(address(silent.getsockname()[1]))
+        with pytest.raises(LiveError, match=r"no Rerun viewer .it does not answer with HTTP/2"):
             viewer.open("some", rrb.Blueprint())
 
 
