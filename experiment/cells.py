@@ -9,8 +9,8 @@ from experiment.methods import Method
 
 TRAIN, COLLECT, RECONSTRUCT = "train", "collect", "reconstruct"
 KINDS = (TRAIN, COLLECT, RECONSTRUCT)
-FIRST_START = 1000
-"""Seed of the first start; every method starts at the same places."""
+START_SEEDS = 1000
+"""Seed of the first start of seed 0, and from one start of a seed to its next: more starts leave those before them."""
 SURFACE_OBSERVATION = {"map": "surface_map"}
 """What a policy that learns from surfaces observes instead."""
 
@@ -103,7 +103,8 @@ def _episodes(
     for start in range(configuration.preset.starts):
         rollout = _rollout(configuration, root, method, seed, scene, start, training)
         cells += [rollout, _reconstruction(configuration, root, rollout, None)]
-        if start == 0:
+        # Learned policies are compared at equal views, over all their episodes; baselines are curves of a figure.
+        if start == 0 or method.learned:
             cells += [_reconstruction(configuration, root, rollout, k) for k in configuration.preset.prefixes]
     return cells
 
@@ -123,7 +124,7 @@ def _rollout(
     policy = ["--policy", str(training.output(root)), "--stochastic"] if training else ["--policy", method.name]
     words = ["python", "-m", "avp_habitat.collect", "--scene", scene.spec, *policy, "--reward", method.reward]
     # Every method starts at the same places.
-    words += ["--seed", str(FIRST_START + seed * preset.starts + start), "--budget", str(preset.budget)]
+    words += ["--seed", str(START_SEEDS * (1 + start) + seed), "--budget", str(preset.budget)]
     words += ["--width", str(width), "--height", str(height), "--simulator", configuration.simulator]
     words += ["--out", str(out), "--mlflow", "off"]
     return Cell(COLLECT, name, tuple(words), out.name, method, seed, scene, start, needs=training)

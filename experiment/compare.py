@@ -7,7 +7,7 @@ import shutil
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,6 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--unseen", default="builtin:1", help="scenes never trained in, with commas between, or none (%(default)s)")
     add("--preset", default="cpu", help=f"{', '.join(PRESETS)} (default: %(default)s)")
     add("--seeds", default=AUTO, help="trainings of each reward; auto: the preset's (default: %(default)s)")
+    add("--starts", default=AUTO, help="episodes of each method, scene and seed; auto: the preset's")
     add("--methods", default=AUTO, help=f"with commas between, of {', '.join(METHODS)}; auto: {', '.join(DEFAULT)}")
     add("--simulator", default="raycast", help=f"{', '.join(SIMULATOR_NAMES)} (default: %(default)s)")
     add(
@@ -70,6 +71,8 @@ def read_options(argv: Sequence[str]) -> Options:
     preset = preset_named(given.preset)
     methods = chosen_methods(DEFAULT if given.methods == AUTO else _split(given.methods))
     seeds = preset.seeds if given.seeds == AUTO else _number("seeds", given.seeds)
+    if given.starts != AUTO:
+        preset = replace(preset, starts=_number("starts", given.starts))
     jobs = default_jobs() if given.jobs == AUTO else _number("jobs", given.jobs)
     if given.simulator not in SIMULATOR_NAMES:
         raise unknown_name("simulator", given.simulator, SIMULATOR_NAMES)
@@ -102,7 +105,7 @@ def check_disk(options: Options, store: Store, cells: Sequence[Cell]) -> None:
     if needed > free:
         raise AVPError(
             f"out: {options.out}: the {len(left)} cells to do need about {_size(needed)}, and {_size(free)} are free "
-            "there; name a folder on another disk, or a smaller preset, fewer seeds or methods"
+            "there; name a folder on another disk, or a smaller preset, fewer seeds, starts or methods"
         )
     print(f"{len(left)} of {len(cells)} cells to do, about {_size(needed)} of disk ({_size(free)} free): {options.out}")
 

@@ -65,7 +65,7 @@ class Configuration:
         return tuple([room for seed in seeds if (room := f"builtin:{seed}") not in taken][: self.preset.rooms])
 
     def as_json(self) -> dict[str, Any]:
-        """What may not change within a folder; methods may be added."""
+        """Scenes, preset and its values as the results state them."""
         scenes = [{"name": scene.name, "sha256": scene.sha256, "role": scene.role} for scene in self.scenes]
         values = asdict(self.preset)
         width, height = values.pop("size")
@@ -112,9 +112,9 @@ def keep(configuration: Configuration, folder: Path) -> None:
         UsageError: the folder holds something else, or an experiment of another configuration.
         AVPError: nothing can be written there.
     """
-    path, wanted = folder / FILE, configuration.as_json()
+    path, wanted = folder / FILE, _fixed(configuration.as_json())
     if path.exists():
-        known = _known(path)
+        known = _fixed(_known(path))
         if different := sorted(name for name in {*wanted, *known} if wanted.get(name) != known.get(name)):
             raise UsageError(
                 f"out: {folder} holds an experiment of another configuration: "
@@ -130,6 +130,11 @@ def keep(configuration: Configuration, folder: Path) -> None:
         temporary.replace(path)
     except OSError as error:
         raise AVPError(f"out: {folder}: cannot write there: {error.strerror}") from None
+
+
+def _fixed(values: dict[str, Any]) -> dict[str, Any]:
+    """What may not change within a folder; methods and starts may be added."""
+    return {name: value for name, value in values.items() if name != "starts"}
 
 
 def _known(path: Path) -> dict[str, Any]:

@@ -14,7 +14,7 @@ class Preset:
     seeds: int
     """Trainings of each reward, and places to start from, unless the user asks for another number."""
     starts: int
-    """Episodes of each method, scene and seed."""
+    """Episodes of each method, scene and seed, unless the user asks for another number."""
     observation: str
     """What the policies observe; `map` becomes what the reward `surface` needs for that reward."""
     steps: int
@@ -30,7 +30,7 @@ class Preset:
     iterations: int
     """Of each reconstruction."""
     prefixes: tuple[int, ...]
-    """Each first episode is also reconstructed from its first so many frames."""
+    """Each first episode, and every one of a learned policy, is also reconstructed from its first so many frames."""
     budget: int = 80
     """T: most views of an episode."""
     heldout_pictures: tuple[int, ...] = (3, 11, 16)

@@ -32,7 +32,8 @@ def test_the_matrix_holds_every_training_rollout_and_reconstruction(tmp_path):
     assert Counter(cell.kind for cell in cells) == {
         TRAIN: 2 * 2,
         COLLECT: rollouts,
-        RECONSTRUCT: rollouts + 3 * 2 * 2 * 2,  # two prefixes of each first start
+        # Two prefixes of the first start of each, and of the second one of both policies.
+        RECONSTRUCT: rollouts + 3 * 2 * 2 * 2 + 2 * 2 * 2 * 2,
     }
     assert len({cell.key for cell in cells}) == len(cells)
 
@@ -52,6 +53,15 @@ def test_all_methods_start_at_the_same_places_and_no_place_comes_twice(tmp_path)
         assert len(found) == 1
         starts.setdefault(key[0], []).extend(found)
     assert all(len(set(seeds)) == 4 for seeds in starts.values())
+
+
+def test_more_starts_leave_what_is_there(tmp_path):
+    few, more = (plan(configuration(starts=starts), tmp_path, tracking="avp") for starts in (1, 3))
+    words = {cell.key: cell.words for cell in more}
+    assert all(words[cell.key] == cell.words for cell in few)
+    keep(configuration(starts=1), tmp_path)
+    keep(configuration(starts=3), tmp_path)
+    keep(configuration(starts=2), tmp_path)
 
 
 def test_a_policy_is_trained_in_the_scenes_of_training_or_in_rooms_and_never_in_unseen_ones(tmp_path):
