@@ -24,10 +24,11 @@ def words_of(name):
 
 def options_of(words):
     """What the command's own parser makes of a command line."""
-    assert words[0] == "python"
-    if words[1] == "-m":
-        return importlib.import_module(words[2])._parser().parse_args(words[3:])
-    return runpy.run_path(str(ROOT / words[1]))["_parser"]().parse_args(words[2:])
+    assert words[:2] == ["python", "-m"]
+    name, *rest = words[3:] if words[2] == "experiment.part" else words[2:]
+    if name.endswith(".py"):
+        return runpy.run_path(str(ROOT / name))["_parser"]().parse_args(rest)
+    return importlib.import_module(name)._parser().parse_args(rest)
 
 
 def test_the_project_has_the_entry_points_that_its_page_shows():
@@ -65,10 +66,23 @@ def test_a_user_mistake_ends_mlflow_run_with_the_commands_one_line(tmp_path, mon
     assert not (tmp_path / "e").exists()
 
 
-def test_a_python_without_the_packages_is_told_in_one_line():
+@pytest.mark.parametrize("name", POINTS)
+def test_a_python_without_the_packages_is_told_in_one_line(name):
     # -S leaves site-packages out, as the `python` of a path without the environment does.
-    words = [sys.executable, "-S", "-m", "experiment.compare", "--preset", "smoke"]
+    words = [sys.executable, "-S", *words_of(name)[1:]]
     answer = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
     assert answer.returncode == 1
     assert answer.stderr.strip().endswith("first: source .venv/bin/activate")
     assert len(answer.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", [name for name in POINTS if name != "compare"])
+def test_a_part_takes_its_words_and_answers_as_it_does_alone(name):
+    target = words_of(name)[3]
+    lines = (["-m", "experiment.part", target], [target] if target.endswith(".py") else ["-m", target])
+    through, alone = (
+        subprocess.run([sys.executable, *line, "--no-such"], cwd=ROOT, capture_output=True, text=True) for line in lines
+    )
+    assert through.returncode == alone.returncode == 2
+    assert through.stderr == alone.stderr
+    assert "error: " in alone.stderr
