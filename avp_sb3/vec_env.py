@@ -17,6 +17,7 @@ from avp_habitat.poses import Intrinsics
 from avp_habitat.settings import TaskSettings
 from avp_habitat.simulators import ONE_PER_PROCESS, Frames, Simulator, SimulatorChoice, open_simulator
 from avp_habitat.spaces import action_space, observation_space
+from avp_habitat.surfaces import scene_surface
 from avp_habitat.task import ViewpointTask
 
 
@@ -156,10 +157,11 @@ _OF_AGENT = {
 
 
 def _check_memory(agents: int, simulators: Sequence[Simulator], settings: TaskSettings) -> None:
-    """Refuse what would end in the middle of making it: the agents' cells, paths, logs and newest observations."""
+    """Refuse what would end in the middle of making it: the agents' cells, surfaces, paths, logs and observations."""
     cells = max(len(simulator.area.centres) for simulator in simulators)
     numbers = gymnasium.spaces.flatdim(observation_space(settings.observation))
-    needed = agents * (2 * cells + 8 * 24 * (settings.budget + 1) + 3 * 4 * numbers)
+    points = max(len(scene_surface(each, settings).points) for each in simulators) if settings.with_surface else 0
+    needed = agents * (2 * cells + 4 * points + 8 * 24 * (settings.budget + 1) + 3 * 4 * numbers)
     free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if needed > free:
         raise UsageError(

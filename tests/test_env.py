@@ -1,3 +1,5 @@
+import re
+
 import gymnasium
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from avp_habitat.poses import Intrinsics, project, unproject
 from avp_habitat.rewards import PARTS
 from avp_habitat.settings import MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, TaskSettings
 from avp_habitat.simulators import make_simulator
+from avp_habitat.surfaces import scene_surface
 from avp_sb3 import AVPVecEnv
 
 SMALL = {"width": 32, "height": 24}
@@ -231,6 +234,18 @@ def test_agents_walk_in_their_own_scenes_as_if_alone():
 def test_numbers_of_agents_that_cannot_be_are_refused(scenes, agents, words):
     with pytest.raises(UsageError, match=words):
         AVPVecEnv(scenes, agents=agents)
+
+
+def test_what_agents_remember_of_surfaces_counts_too():
+    def gigabytes(settings):
+        with pytest.raises(UsageError, match="GiB are free") as refused:
+            AVPVecEnv("builtin:0", simulator=simulator, agents=10**9, settings=settings)
+        return float(re.findall(r"about (\S+) GiB", str(refused.value))[0])
+
+    simulator = make_simulator("raycast", "builtin:0")
+    floor, surface = (TaskSettings(reward=reward, **SMALL) for reward in ("proposed", "surface"))
+    points = len(scene_surface(simulator, surface).points)
+    assert gigabytes(surface) - gigabytes(floor) == pytest.approx(4 * points * 10**9 / 2**30, rel=1e-3)
 
 
 def test_a_broken_scene_in_a_list_is_named_before_training(tmp_path):
