@@ -103,9 +103,7 @@ def _episodes(
     for start in range(configuration.preset.starts):
         rollout = _rollout(configuration, root, method, seed, scene, start, training)
         cells += [rollout, _reconstruction(configuration, root, rollout, None)]
-        # Learned policies are compared at equal views, over all their episodes; baselines are curves of a figure.
-        if start == 0 or method.learned:
-            cells += [_reconstruction(configuration, root, rollout, k) for k in configuration.preset.prefixes]
+        cells += [_reconstruction(configuration, root, rollout, k) for k in configuration.preset.prefixes]
     return cells
 
 

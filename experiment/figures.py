@@ -99,7 +99,7 @@ def psnr_by_views(results: Results) -> Made:
     caption = (
         "PSNR of reconstructions from the first k frames of an episode; the last point of a line is the whole episode, "
         f"at its mean number of views. Means over {_count(results, 'seeds')}, of the episodes that were also "
-        "reconstructed in part (the first of each seed); bars: 95 % confidence interval over seeds (Student's t). A "
+        "reconstructed in part; bars: 95 % confidence interval over seeds (Student's t). A "
         "point is left out where some of these episodes ended before."
     )
     return Made(picture, caption)
