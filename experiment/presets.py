@@ -87,7 +87,7 @@ PRESETS = {
         prefixes=(20, 40, 60),
     ),
 }
-"""smoke: minutes, to see that everything works. cpu: an hour or two on two cores. gpu: the same questions at full
+"""smoke: minutes, to see that everything works. cpu: two to three hours on two cores. gpu: the same questions at full
 size. paper: the paper's observation, steps and reconstruction."""
 
 
