@@ -54,6 +54,11 @@ def test_all_methods_start_at_the_same_places_and_no_place_comes_twice(tmp_path)
     assert all(len(set(seeds)) == 4 for seeds in starts.values())
 
 
+def test_the_users_number_of_starts_replaces_the_presets():
+    options = compare.read_options(["--preset", "smoke", "--starts", "4", "--unseen", "none"])
+    assert options.configuration.preset == replace(PRESETS["smoke"], starts=4)
+
+
 def test_more_starts_leave_what_is_there(tmp_path):
     few, more = (plan(configuration(starts=starts), tmp_path, tracking="avp") for starts in (1, 3))
     words = {cell.key: cell.words for cell in more}
@@ -148,6 +153,7 @@ def refused(capsys, *words):
         (("--methods", "heuristic,propposed"), 2, "did you mean 'proposed'?"),
         (("--methods", ","), 2, "methods: expected at least one"),
         (("--seeds", "0"), 2, "seeds: expected a whole number from 1, or auto, got '0'"),
+        (("--starts", "0"), 2, "starts: expected a whole number from 1, or auto, got '0'"),
         (("--seeds", "2.5"), 2, "seeds: expected a whole number"),
         (("--jobs", "-1"), 2, "jobs: expected a whole number"),
         (("--simulator", "raycats"), 2, "did you mean 'raycast'?"),
