@@ -60,7 +60,7 @@ FORMS = {
     "make demo": Form(r"examples/demo\.py", {"make": f"make --dry-run --directory {ROOT}"}),
     "make test": Form(r'-m pytest .* -m "not slow"', {"make": f"make --dry-run --directory {ROOT}"}),
     # tests/test_experiment_compare.py runs it whole, in minutes; here it gets as far as its parameters.
-    "mlflow run . -e compare --env-manager local -P scene=white_room.glb -P unseen=grey_white_room.glb -P seeds=3"
+    "mlflow run . -e compare --env-manager local -P scene=white_room.glb -P unseen=grey_white_room.glb -P starts=3"
     " -P preset=cpu": Form(
         r"^error: unknown preset 'nosuch': expected one of .*cpu",
         {
