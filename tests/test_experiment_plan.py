@@ -10,7 +10,8 @@ from avp_habitat import command
 from experiment import compare
 from experiment.cells import COLLECT, RECONSTRUCT, TRAIN, plan
 from experiment.configuration import Configuration, Scene, keep
-from experiment.methods import DEFAULT, chosen_methods
+from experiment.look import look_of
+from experiment.methods import DEFAULT, METHODS, chosen_methods
 from experiment.presets import PRESETS
 from experiment.store import Store
 
@@ -199,3 +200,8 @@ def test_the_configuration_that_is_kept_is_readable(tmp_path):
     found = json.loads((tmp_path / "e" / "experiment.json").read_text())
     assert found["seeds"] == 2
     assert [scene["role"] for scene in found["scenes"]] == ["train", "unseen"]
+
+
+def test_every_method_has_a_look_of_its_own():
+    looks = [look_of(method) for method in METHODS]
+    assert len(set(looks)) == len(looks)

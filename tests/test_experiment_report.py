@@ -9,13 +9,10 @@ import pytest
 from experiment_results import METHODS, SCENES, make_results, write_results
 from PIL import Image
 from scipy import stats
-from small_rollout import write_small_rollout
 
-from avp_habitat import command, images
-from avp_habitat.errors import AVPError, RolloutError, UsageError
-from experiment.floor_map import floor_map, floor_of
+from avp_habitat import command
+from avp_habitat.errors import AVPError, UsageError
 from experiment.report import main, write_report
-from experiment.statistics import at_views, spearman, views_to_reach
 from experiment.stored import read_results
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -209,35 +206,6 @@ def test_the_correlation_is_that_of_scipy_and_called_what_it_is(report):
     assert "have ρ = -1.00 [-1.00, -1.00], below 0.8" in section(report(results), "Visibility")
 
 
-def test_correlation_with_equal_values_is_that_of_scipy():
-    rng = np.random.default_rng(3)
-    x, y = rng.integers(0, 6, (2, 60))
-    assert spearman(x, y, list(range(60))).rho == pytest.approx(stats.spearmanr(x, y)[0])
-    assert spearman(x, np.ones(60), list(range(60))) is None
-
-
-def test_reconstructions_of_one_rollout_are_drawn_together():
-    rng = np.random.default_rng(0)
-    x = np.repeat(rng.normal(size=12), 10)
-    y = np.repeat(rng.normal(size=12), 10)
-    together = spearman(x, y, np.repeat(np.arange(12), 10).tolist())
-    apart = spearman(x, y, list(range(120)))
-    assert together.rho == apart.rho
-    assert together.high - together.low > 2 * (apart.high - apart.low)
-
-
-def test_between_measured_views_a_curve_is_linear_and_outside_it_is_unknown():
-    curve = {20: 10.0, 40: 14.0, 60: 13.0, 80: 20.0}
-    assert at_views(curve, 30) == 12
-    assert at_views(curve, 80) == 20
-    assert at_views(curve, 19) is None
-    assert at_views(curve, 81) is None
-    assert views_to_reach(curve, 12) == 30
-    assert views_to_reach(curve, 16.5) == 70
-    assert views_to_reach(curve, 9) == 20
-    assert views_to_reach(curve, 21) is None
-
-
 def test_a_failed_cell_is_named_with_its_reason(report):
     results = make_results(FEW)
     results["failed"] = [{"cell": "train/surface-1", "reason": "exit code 1: no memory", "log": "cells/log.txt"}]
@@ -368,51 +336,6 @@ def test_the_command_stands_on_its_own(tmp_path):
     line = [sys.executable, "-m", "experiment.report", "--help"]
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=True)
     assert "results.json" in done.stdout
-
-
-def test_every_method_has_a_look_of_its_own():
-    from experiment.look import look_of
-    from experiment.methods import METHODS as KNOWN
-
-    assert set(METHODS) <= set(KNOWN)
-    looks = [look_of(method) for method in KNOWN]
-    assert len(set(looks)) == len(looks)
-
-
-def with_floor(folder, numbers):
-    """A small rollout that has a floor."""
-    write_small_rollout(folder)
-    images.write_numbers(folder / "floor.png", numbers)
-    meta = json.loads((folder / "rollout.json").read_text())
-    meta["floor"] = {"file": "floor.png", "cell_m": 0.1, "origin_m": [1.0, -2.0], "shape": list(numbers.shape)}
-    (folder / "rollout.json").write_text(json.dumps(meta))
-    return folder
-
-
-def test_a_map_of_a_rollout_holds_its_floor_and_its_path(tmp_path):
-    numbers = np.array([[0, 1, 2], [3, 700, 0]], dtype=np.uint16)
-    folder = with_floor(tmp_path / "r", numbers)
-    add_yaw(folder / "steps.csv")
-    found = json.loads(json.dumps(floor_map(folder)))
-    np.testing.assert_array_equal(floor_of(found), numbers)
-    assert (found["cell_m"], found["origin_m"], found["shape"]) == (0.1, [1.0, -2.0], [2, 3])
-    rows = list(csv.DictReader((folder / "steps.csv").open()))
-    assert found["path"] == [pytest.approx([float(r["x_m"]), float(r["z_m"]), 0.25], abs=1e-4) for r in rows]
-
-
-def add_yaw(path):
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join([f"{lines[0]},yaw_rad", *(f"{line},0.25" for line in lines[1:])]) + "\n")
-
-
-def test_a_rollout_without_a_floor_has_no_map(tmp_path):
-    assert floor_map(write_small_rollout(tmp_path / "r")) is None
-
-
-def test_a_table_of_steps_without_angles_is_named(tmp_path):
-    folder = with_floor(tmp_path / "r", np.ones((2, 2), dtype=np.uint16))
-    with pytest.raises(RolloutError, match=r"steps\.csv: expected x_m, z_m and yaw_rad"):
-        floor_map(folder)
 
 
 def test_a_folder_that_is_none_is_refused_by_the_function_too(tmp_path):
