@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from experiment_results import METHODS, SCENES, make_results, write_results
+from experiment_results import SCENES, make_results, write_results
 from PIL import Image
 from scipy import stats
 
