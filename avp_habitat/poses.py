@@ -165,6 +165,18 @@ def project_pairs(points: Float, pose: Float, intrinsics: Intrinsics) -> tuple[F
     return _pinhole(np.einsum("kij,ki->kj", pose[:, :3, :3], points - pose[:, :3, 3]), intrinsics)
 
 
+def in_image(pixel: Float, depth: Float, intrinsics: Intrinsics) -> NDArray[np.bool_]:
+    """Which projected points lie in front of the camera and inside its image; the right and lower borders are outside.
+
+    Args:
+        pixel: `(..., 2)` pixel coordinates, as `project` and `project_pairs` give them.
+        depth: `(...)` planar depth in metres.
+        intrinsics: of the camera.
+    """
+    u, v = pixel[..., 0], pixel[..., 1]
+    return (depth > 0) & (u >= 0) & (u < intrinsics.width) & (v >= 0) & (v < intrinsics.height)
+
+
 def _pinhole(local: Float, intrinsics: Intrinsics) -> tuple[Float, Float]:
     """Pixels `(..., 2)` and planar depth `(...)` of points `(..., 3)` in habitat camera axes."""
     depth = -local[..., 2]

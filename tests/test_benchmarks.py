@@ -129,15 +129,15 @@ def test_rays_are_remembered_only_between_start_and_stop_and_cast_again():
     from rays import RecordingSimulator
 
     simulator = RecordingSimulator(load_scene("builtin:0"))
-    pose = np.tile(np.eye(4), (2, 1, 1))
+    pose, eye = np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 3))
     camera = Intrinsics.from_hfov(8, 6, hfov_deg=90)
     points, pairs = np.array([[0.0, 0.0, -1.0]]), np.array([[0, 0], [1, 0]])
     simulator.render(pose, camera, rgb=False)
     simulator.start()
     simulator.render(pose, camera, rgb=False)
-    simulator.visible(pose, points, pairs, tolerance_m=0.1)
+    simulator.visible(pose, camera, points, pairs, tolerance_m=0.1)
     simulator.stop()
-    simulator.visible(pose, points, pairs, tolerance_m=0.1)
+    simulator.reached(eye, points, pairs, tolerance_m=0.1)
     assert simulator.count == 2 * 8 * 6 + 2
     assert simulator.replay()[0] == simulator.count
     assert simulator.replay(seconds=0.0)[0] == 2 * 8 * 6

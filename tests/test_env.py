@@ -85,7 +85,7 @@ def test_a_visible_floor_point_lands_on_its_pixel_of_the_depth_image(env):
     for pose in heldout_poses(env.simulator, sensor_height_m=1.5, views=6)[:, None]:
         everything = np.ones((1, len(points)), dtype=bool)
         pairs = candidates(pose, camera, points, everything, max_range_m=6.0)
-        seen = points[pairs[env.simulator.visible(pose, points, pairs, tolerance_m=0.01), 1]]
+        seen = points[pairs[env.simulator.visible(pose, camera, points, pairs, tolerance_m=0.01), 1]]
         if not len(seen):
             continue
         surface = unproject(env.capture(pose, camera).depth[0], pose[0], camera)

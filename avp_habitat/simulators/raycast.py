@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avp_habitat.coverage import pairs_in_image
 from avp_habitat.poses import Intrinsics, pixel_directions
 from avp_habitat.simulators.base import Frames
 
@@ -118,23 +119,23 @@ class RaycastSimulator:
     def visible(
         self,
         camera_to_world: NDArray[np.floating],
+        intrinsics: Intrinsics,
         points: NDArray[np.floating],
         pairs: NDArray[np.integer],
         *,
         tolerance_m: float,
     ) -> NDArray[np.bool_]:
-        """Whether camera rays reach points.
+        """Whether cameras see points; see `simulators.base.Simulator.visible`."""
+        seen = pairs_in_image(camera_to_world, intrinsics, points, pairs)
+        eye = np.asarray(camera_to_world)[:, :3, 3]
+        seen[seen] = self.reached(eye, points, pairs[seen], tolerance_m=tolerance_m)
+        return seen
 
-        Args:
-            camera_to_world: `(n, 4, 4)` habitat poses.
-            points: `(m, 3)` metres, world frame.
-            pairs: `(k, 2)` rows (camera, point); the points are inside those cameras' images.
-            tolerance_m: a hit this close before the point still reaches it, in metres along the ray.
-
-        Returns:
-            `(k,)`; a point nearer than the tolerance is always reached.
-        """
-        origin = np.asarray(camera_to_world, dtype=np.float64)[pairs[:, 0], :3, 3]
+    def reached(
+        self, eye: NDArray[np.floating], points: NDArray[np.floating], pairs: NDArray[np.integer], *, tolerance_m: float
+    ) -> NDArray[np.bool_]:
+        """Whether rays reach points in any direction; see `simulators.base.SingleRays.reached`."""
+        origin = np.asarray(eye, dtype=np.float64)[pairs[:, 0]]
         offset = np.asarray(points, dtype=np.float64)[pairs[:, 1]] - origin
         distance = np.sqrt((offset * offset).sum(axis=1))
         far = distance > tolerance_m
