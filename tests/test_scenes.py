@@ -121,6 +121,27 @@ def test_nested_nodes_apply_scale_then_rotation_then_translation_then_the_parent
     np.testing.assert_allclose(load_scene(document.write(tmp_path)).mesh.vertices[3], expected, atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        [{"mesh": 0, "scale": [-1, 1, 1]}],
+        [{"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -2, 0, 3, 4, 5, 1]}],
+        [{"scale": [1, -1, 1], "children": [1]}, {"mesh": 0, "rotation": [0, 0.6, 0, 0.8]}],
+    ],
+    ids=["scale", "matrix", "parent"],
+)
+def test_a_mirroring_node_turns_the_winding_over(tmp_path, nodes):
+    """What was counter-clockwise seen from the front stays so (glTF 2.0, section 3.7.4)."""
+    mesh = load_scene(quad(nodes=nodes, scenes=[{"nodes": [0]}]).write(tmp_path)).mesh
+    assert mesh.triangles.tolist() == [[2, 1, 0], [3, 1, 2]]
+
+
+def test_two_mirrors_leave_the_winding(tmp_path):
+    nodes = [{"scale": [-1, 1, 1], "children": [1]}, {"mesh": 0, "scale": [1, 1, -3]}]
+    mesh = load_scene(quad(nodes=nodes, scenes=[{"nodes": [0]}]).write(tmp_path)).mesh
+    assert mesh.triangles.tolist() == [[0, 1, 2], [2, 1, 3]]
+
+
 def test_only_the_default_scene_is_read_and_a_mesh_may_be_used_twice(tmp_path):
     nodes = [{"mesh": 0, "translation": [9, 9, 9]}, {"mesh": 0}, {"mesh": 0, "translation": [0, 0, 5]}]
     document = quad(nodes=nodes, scenes=[{"nodes": [0]}, {"nodes": [1, 2]}], scene=1)
