@@ -259,7 +259,7 @@ def _is_finite(value: Any) -> TypeGuard[float]:
 
 
 def _check_listing(root: Path, folder: Path, suffix: str, count: int) -> None:
-    """Hold a folder to exactly the files of `count` frames, none of them leading out of the rollout."""
+    """Hold a folder to exactly the files of `count` frames; links may lead anywhere, as into a store of DVC."""
     _check_inside(root, folder)
     try:
         with os.scandir(folder) as entries:
@@ -283,9 +283,12 @@ def _check_listing(root: Path, folder: Path, suffix: str, count: int) -> None:
 
 
 def _check_inside(root: Path, path: Path) -> None:
+    """Refuse a path that leaves the rollout as it is written, and a link that leads to itself."""
+    if not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(root)):
+        raise RolloutError(f"{path}: expected a path inside {root}")
     try:
-        leads_to = path.resolve()
+        path.resolve(strict=path.is_symlink())
+    except FileNotFoundError:
+        raise RolloutError(f"{path}: expected a file, found a link to {os.readlink(path)}, which is missing") from None
     except (OSError, RuntimeError):
-        raise RolloutError(f"{path}: expected a path inside {root}, found a link that leads to itself") from None
-    if not leads_to.is_relative_to(root.resolve()):
-        raise RolloutError(f"{path}: expected a path inside {root}, it leads to {leads_to}")
+        raise RolloutError(f"{path}: expected a file, found a link that leads to itself") from None

@@ -58,11 +58,10 @@ def _used(mesh: TexturedMesh) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
 def _check_floor(vertices: NDArray[np.float32], triangles: NDArray[np.int32], settings: NavigationSettings) -> None:
     if level_triangles(vertices, triangles, settings.max_slope_deg).any():
         return
-    found = f"the scene has no floor: none of its {len(triangles)} triangles faces upwards (+Y) within "
-    found += f"{settings.max_slope_deg:g}° of level"
-    if level_triangles(vertices, triangles[:, ::-1], settings.max_slope_deg).any():
-        raise SceneError(f"{found}, but some face downwards; are the triangles wound the wrong way round?")
-    raise SceneError(f"{found}; is the mesh Z-up instead of Y-up?")
+    raise SceneError(
+        f"the scene has no floor: none of its {len(triangles)} triangles lies within {settings.max_slope_deg:g}° of "
+        "level; is the mesh Z-up instead of Y-up?"
+    )
 
 
 def _no_place(vertices: NDArray[np.float32], settings: NavigationSettings) -> str:
@@ -71,7 +70,7 @@ def _no_place(vertices: NDArray[np.float32], settings: NavigationSettings) -> st
     return (
         f"no agent can stand in the scene, which measures {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m (x, y, z): "
         f"expected {least:g} m² of connected floor with {settings.height_voxels * settings.voxel_height_m:g} m of free "
-        "height; is it not in metres, Z-up instead of Y-up, its floor wound to face downwards, or the ceiling lower "
+        "height; is it not in metres, Z-up instead of Y-up, or the ceiling lower "
         f"than {settings.agent_height_m:g} m?"
     )
 

@@ -132,6 +132,9 @@ class _Reader:
         vertices = (local @ to_world[:3, :3].T + to_world[:3, 3]).astype(np.float32)
         surface = self._surface(primitive.material)
         triangles = self._triangles(primitive.indices, mode, len(vertices))
+        if np.linalg.det(to_world[:3, :3]) < 0:
+            # A mirroring node turns the winding over (glTF 2.0, section 3.7.4).
+            triangles = triangles[:, ::-1]
         uv = self._coordinates(attributes, surface, len(vertices))
         textured = surface.texture is not None and uv is not None
         return TexturedMesh(

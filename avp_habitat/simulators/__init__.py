@@ -1,6 +1,7 @@
 """The simulators by name, made once per scene and process."""
 
 import gc
+import os
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -64,7 +65,8 @@ def open_simulator(choice: SimulatorChoice, scene: str) -> Simulator:
     """The chosen simulator on a scene; arguments and errors as of `make_simulator`."""
     choice.check()
     path = Path(scene)
-    key = (choice, str(path.resolve()), path.stat().st_mtime) if path.is_file() else (choice, scene, 0.0)
+    # Not where a link leads: what a file refers to lies beside the link.
+    key = (choice, os.path.abspath(path), path.stat().st_mtime) if path.is_file() else (choice, scene, 0.0)
     simulator = _shared.get(key)
     if simulator is None or _is_closed(simulator):
         if choice.name in ONE_PER_PROCESS:

@@ -1,6 +1,7 @@
 """How a scene is handed to Habitat-Sim: its own dataset config, or one that is written to a temporary folder."""
 
 import json
+import os
 from pathlib import Path
 
 from avp_habitat.scenes.location import SceneLocation
@@ -27,9 +28,9 @@ def write_stage(scene: str, location: SceneLocation, folder: Path) -> tuple[Path
         Path of the `.scene_dataset_config.json`, and the scene's id.
     """
     if location.objects and location.dataset is not None and location.scene_id is not None:
-        return location.dataset.resolve(), location.scene_id
+        return Path(os.path.abspath(location.dataset)), location.scene_id
     if location.asset is not None and location.asset.suffix.lower() in _AS_IT_IS:
-        asset, (up, front) = location.asset.resolve(), (location.up, location.front)
+        asset, (up, front) = os.path.abspath(location.asset), (location.up, location.front)
     else:
         asset, (up, front) = _as_glb(scene, folder), Y_UP
     stage = {"render_asset": str(asset), "up": list(up), "front": list(front), "force_flat_shading": True}
