@@ -182,16 +182,17 @@ def _cross(ax, ay, az, bx, by, bz):  # pragma: no cover - compiled
 def _filtered(texels, levels, first, last, u, v, footprint):  # pragma: no cover - compiled
     """Mean colour over the footprint, 0 to 255: probes along its long side, each as wide as its short side."""
     width, height = levels[first, 1], levels[first, 2]
-    right = np.hypot(footprint[0] * width, footprint[1] * height)
-    down = np.hypot(footprint[2] * width, footprint[3] * height)
+    right = np.sqrt((footprint[0] * width) ** 2 + (footprint[1] * height) ** 2)
+    down = np.sqrt((footprint[2] * width) ** 2 + (footprint[3] * height) ** 2)
     long, short = max(right, down), max(min(right, down), 1.0)
     du, dv = (footprint[0], footprint[1]) if right >= down else (footprint[2], footprint[3])
     if not long > 1.0:
-        return _bilinear(texels, levels, first, u, v)
-    if not long < 1e9:
-        return _bilinear(texels, levels, last, u, v)
-    probes = min(int(np.ceil(long / short)), _MAX_PROBES)
-    level = min(np.log2(max(long / probes, 1.0)), float(last - first))
+        probes, level, du, dv = 1, 0.0, 0.0, 0.0
+    elif not long < 1e9:
+        probes, level, du, dv = 1, float(last - first), 0.0, 0.0
+    else:
+        probes = min(int(np.ceil(long / short)), _MAX_PROBES)
+        level = min(np.log2(max(long / probes, 1.0)), float(last - first))
     lower = first + int(level)
     upper, share = min(lower + 1, last), level - int(level)
     red, green, blue = 0.0, 0.0, 0.0
@@ -205,7 +206,7 @@ def _filtered(texels, levels, first, last, u, v, footprint):  # pragma: no cover
     return red / probes, green / probes, blue / probes
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _bilinear(texels, levels, row, u, v):  # pragma: no cover - compiled
     """Colour of one level at (u, v), repeating outside [0, 1]; texel centres lie at +0.5."""
     offset, width, height = levels[row, 0], levels[row, 1], levels[row, 2]
@@ -225,7 +226,7 @@ def _bilinear(texels, levels, row, u, v):  # pragma: no cover - compiled
     )
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _wrapped(index, count):  # pragma: no cover - compiled
     """An index from -1 to `count`, repeating; anything else, as of a (u, v) that is no number, stays in the picture."""
     return index if 0 <= index < count else count - 1
