@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from avp_habitat.scenes.mesh import TexturedMesh
 
 _MAX_PROBES = 8
-_PIXELS_PER_TASK = 1 << 14
+_PIXELS_PER_TASK = 1 << 15
 _PACKED = np.array([1, 1 << 8, 1 << 16], np.uint32)
 
 
@@ -122,7 +122,7 @@ def _shade(surface, hits, camera, start, stop, out):  # pragma: no cover - compi
         if not distance < np.inf:
             continue
         triangle = hits.triangle[camera, pixel]
-        a, b, c = triangles[triangle, 0], triangles[triangle, 1], triangles[triangle, 2]
+        a, b, c = np.uint64(triangles[triangle, 0]), np.uint64(triangles[triangle, 1]), np.uint64(triangles[triangle, 2])
         wb, wc = barycentric[camera, pixel, 0], barycentric[camera, pixel, 1]
         wa = 1.0 - wb - wc
         red, green, blue = 255.0, 255.0, 255.0
@@ -218,7 +218,8 @@ def _bilinear(texels, levels, row, u, v):  # pragma: no cover - compiled
     right, lower = (left + 1 if left + 1 < width else 0), (upper + 1 if upper + 1 < height else 0)
     w00, w01, w10, w11 = (1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy
     upper, lower = offset + upper * width, offset + lower * width
-    a, b, c, d = texels[upper + left], texels[upper + right], texels[lower + left], texels[lower + right]
+    a, b = texels[np.uint64(upper + left)], texels[np.uint64(upper + right)]
+    c, d = texels[np.uint64(lower + left)], texels[np.uint64(lower + right)]
     return (
         w00 * (a & 255) + w01 * (b & 255) + w10 * (c & 255) + w11 * (d & 255),
         w00 * (a >> 8 & 255) + w01 * (b >> 8 & 255) + w10 * (c >> 8 & 255) + w11 * (d >> 8 & 255),
