@@ -12,7 +12,6 @@ from avp_habitat.scenes.mesh import TexturedMesh
 
 _MAX_PROBES = 8
 _PIXELS_PER_TASK = 1 << 15
-_PACKED = np.array([1, 1 << 8, 1 << 16], np.uint32)
 
 
 class Surface(NamedTuple):
@@ -20,8 +19,8 @@ class Surface(NamedTuple):
 
     vertices: NDArray[np.float32]
     """`(v, 3)` metres."""
-    triangles: NDArray[np.int32]
-    """`(t, 3)`."""
+    triangles: NDArray[np.uint32]
+    """`(t, 3)`; unsigned, because compiled code looks whether signed indices count from the end."""
     uv: NDArray[np.float32]
     """`(v, 2)`, v down."""
     colours: NDArray[np.float32]
@@ -60,10 +59,10 @@ def pack_surface(mesh: TexturedMesh) -> Surface:
     for level in (level for pyramid in pyramids for level in pyramid):
         levels.append((offset, level.shape[1], level.shape[0]))
         offset += level.shape[0] * level.shape[1]
-    flat = [level.reshape(-1, 3) @ _PACKED for pyramid in pyramids for level in pyramid]
+    flat = [_packed(level) for pyramid in pyramids for level in pyramid]
     return Surface(
         np.ascontiguousarray(mesh.vertices, np.float32),
-        np.ascontiguousarray(mesh.triangles, np.int32),
+        np.ascontiguousarray(mesh.triangles, np.int32).view(np.uint32),
         np.ascontiguousarray(mesh.uv, np.float32),
         np.ascontiguousarray(mesh.colours, np.float32),
         np.ascontiguousarray(mesh.texture_index, np.int32),
@@ -71,6 +70,11 @@ def pack_surface(mesh: TexturedMesh) -> Surface:
         np.array(levels, np.int64).reshape(-1, 3),
         np.cumsum([0] + [len(pyramid) for pyramid in pyramids], dtype=np.int64),
     )
+
+
+def _packed(picture: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    red, green, blue = picture.reshape(-1, 3).astype(np.uint32).T
+    return red | green << 8 | blue << 16
 
 
 def _pyramid(texture: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
@@ -122,7 +126,7 @@ def _shade(surface, hits, camera, start, stop, out):  # pragma: no cover - compi
         if not distance < np.inf:
             continue
         triangle = hits.triangle[camera, pixel]
-        a, b, c = np.uint64(triangles[triangle, 0]), np.uint64(triangles[triangle, 1]), np.uint64(triangles[triangle, 2])
+        a, b, c = triangles[triangle, 0], triangles[triangle, 1], triangles[triangle, 2]
         wb, wc = barycentric[camera, pixel, 0], barycentric[camera, pixel, 1]
         wa = 1.0 - wb - wc
         red, green, blue = 255.0, 255.0, 255.0
