@@ -1,10 +1,13 @@
-"""Reading and writing the PNG files of a rollout, with Pillow."""
+"""Reading and writing the PNG files of a rollout."""
 
+import zlib
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+
+from avp_habitat.png import GREY_16, RGB_8, encode_png
 
 DEPTH_UNIT_M = 0.001
 _MAX_STORED_DEPTH = np.iinfo(np.uint16).max
@@ -17,17 +20,18 @@ def encode_depth(depth: NDArray[np.floating]) -> NDArray[np.uint16]:
 
 def write_rgb(path: Path, rgb: NDArray[np.uint8]) -> None:
     """Write `(height, width, 3)` uint8 as PNG."""
-    Image.fromarray(rgb, mode="RGB").save(path, format="PNG", compress_level=4)
+    # Runs of equal bytes only: faster than a search for longer repeats, which rendered pictures hardly have.
+    path.write_bytes(encode_png(rgb, RGB_8, level=1, strategy=zlib.Z_RLE))
 
 
 def write_depth(path: Path, depth: NDArray[np.floating]) -> None:
     """Write `(height, width)` planar depth in metres as 16-bit PNG in millimetres."""
-    Image.fromarray(encode_depth(depth)).save(path, format="PNG", compress_level=4)
+    path.write_bytes(encode_png(encode_depth(depth), GREY_16, level=1, strategy=zlib.Z_DEFAULT_STRATEGY))
 
 
 def write_numbers(path: Path, numbers: NDArray[np.uint16]) -> None:
     """Write `(height, width)` whole numbers as 16-bit grey PNG."""
-    Image.fromarray(numbers.astype(np.uint16)).save(path, format="PNG", compress_level=9)
+    path.write_bytes(encode_png(numbers, GREY_16, level=9, strategy=zlib.Z_DEFAULT_STRATEGY))
 
 
 def read_numbers(path: Path) -> NDArray[np.uint16]:

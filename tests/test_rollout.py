@@ -121,6 +121,7 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing(tmp_path):
         # /dev/full fails every write with ENOSPC, as a full disk does.
         (writer.path("images") / "frame_00001.png").symlink_to("/dev/full")
         writer.add_frame(np.zeros((8, 12, 3), dtype=np.uint8), np.ones((8, 12)), some_poses(1)[0])
+        writer.publish({})
 
     with pytest.raises(RolloutError, match="cannot write there: No space left"):
         break_off(tmp_path / "r", fill)
