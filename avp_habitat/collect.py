@@ -16,7 +16,7 @@ from avp_habitat.env import AVPEnv
 from avp_habitat.episode import steps_of
 from avp_habitat.errors import UsageError
 from avp_habitat.heldout import VIEWS
-from avp_habitat.policies import POLICY_NAMES, Policy, check_policy
+from avp_habitat.policies import POLICY_NAMES, TRUSTED, Policy, check_policy
 from avp_habitat.policy_env import make_policy_env
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rewards import REWARD_NAMES
@@ -52,6 +52,8 @@ class Request:
     """Of the pictures that are written."""
     stochastic: bool = False
     """Sample a model's actions instead of taking the likeliest."""
+    trusted: bool = False
+    """Open a model's file also where that may run code which the file holds."""
     heldout: int = VIEWS
     """Number of held-out views."""
 
@@ -69,7 +71,9 @@ def collect(request: Request) -> dict[str, Any]:
     check_policy(request.policy)
     with RolloutWriter(request.out, request.camera) as writer:
         simulator = open_simulator(request.simulator, request.scene)
-        env, policy = make_policy_env(request.policy, simulator, request.settings, seed=request.seed)
+        env, policy = make_policy_env(
+            request.policy, simulator, request.settings, seed=request.seed, trusted=request.trusted
+        )
         total = request.settings.budget + request.heldout
         with tqdm(total=total, unit="view", desc=f"collecting {request.out}", disable=None) as progress:
             info = _capture_episode(request, env, policy, writer, progress)
@@ -114,6 +118,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--width", default=640, type=int, help="of the pictures in pixels (default: %(default)s)")
     add("--height", default=480, type=int, help="of the pictures in pixels (default: %(default)s)")
     add("--stochastic", action="store_true", help="sample a model's actions instead of taking the likeliest")
+    add("--trusted", action="store_true", help=TRUSTED)
     add(
         "--mlflow",
         default="auto",
@@ -146,6 +151,7 @@ def _request(options: argparse.Namespace) -> Request:
         simulator=simulator_choice(options),
         camera=Intrinsics.from_hfov(options.width, options.height, hfov_deg=settings.hfov_deg),
         stochastic=options.stochastic,
+        trusted=options.trusted,
     )
 
 

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from avp_habitat import command
 from avp_habitat.drawing import draw_trajectory
 from avp_habitat.errors import UsageError
-from avp_habitat.policies import POLICY_NAMES
+from avp_habitat.policies import POLICY_NAMES, TRUSTED
 from avp_habitat.rewards import REWARD_NAMES
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.settings import OBSERVATION_NAMES, TaskSettings
@@ -51,6 +51,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--width", default=160, type=int, help="of the policy's depth image in pixels (default: %(default)s)")
     add("--height", default=120, type=int, help="of the policy's depth image in pixels (default: %(default)s)")
     add("--stochastic", action="store_true", help="sample a model's actions instead of taking the likeliest")
+    add("--trusted", action="store_true", help=TRUSTED)
     add("--out", default=None, type=Path, help="folder of the report (default: runs/evaluation-DATE-TIME)")
     add("--experiment", default=EXPERIMENT, help="of MLflow (default: %(default)s)")
     add("--no-mlflow", action="store_true", help="log nothing to MLflow")
@@ -86,6 +87,7 @@ def main(argv: Sequence[str]) -> None:
             navmesh=choice.navmesh,
             observation=options.observation,
             stochastic=options.stochastic,
+            trusted=options.trusted,
         )
         for policy in options.policy
     ]

@@ -31,8 +31,8 @@ class EpisodeWindow:
         if size < 1:
             raise ValueError(f"expected a window of at least 1 episode, got {size}")
         self._size = size
-        self._keys: list[str] = []
-        self._rows = np.empty((0, 0))
+        self._keys = [*MEANS]
+        self._rows = np.zeros((size, len(self._keys)))
         self._added = 0
 
     def add(self, episode: Mapping[str, float]) -> None:
@@ -45,9 +45,11 @@ class EpisodeWindow:
             MissingInfoError: a key of `MEANS`, or the return of a reward part that earlier episodes had, is missing or
                 no number.
         """
-        if not self._added:
-            self._keys = [*MEANS, *sorted(key for key in episode if key.startswith(_RETURN))]
-            self._rows = np.empty((self._size, len(self._keys)))
+        new = [key for key in episode if key.startswith(_RETURN) and key not in self._keys]
+        if new:
+            # A part that earlier episodes did not have gave them nothing.
+            self._keys += sorted(new)
+            self._rows = np.hstack([self._rows, np.zeros((self._size, len(new)))])
         self._rows[self._added % self._size] = [_number(episode, key) for key in self._keys]
         self._added += 1
 

@@ -28,7 +28,7 @@ from avp_sb3.run_facts import hyperparameters, scene_tags, task_settings
 if TYPE_CHECKING:
     from avp_habitat.trajectory import Trajectory
 
-MODEL_FILE = "model.zip"
+MODEL_FILE, STATISTICS_FILE = "model.zip", "model_vecnormalize.pkl"
 PARAMS_FILE = "params.json"
 TRAJECTORY_FILE = "trajectory.png"
 _log = logging.getLogger(__name__)
@@ -80,7 +80,8 @@ class MLflowCallback(BaseCallback):
             tracking_uri: where runs are kept; when omitted, what `mlflow.set_tracking_uri` or `MLFLOW_TRACKING_URI`
                 say, else `sqlite:///mlflow.db` in the current folder.
             run_id: go on with this run; when omitted, with the model's own if it was interrupted.
-            log_model: keep the model as artifact `model.zip`, at the end unless the training failed, and on the way.
+            log_model: keep the model as artifact `model.zip`, at the end unless the training failed, and on the way;
+                with `model_vecnormalize.pkl` where it trains under `VecNormalize`.
             checkpoint_s: seconds between two models that are kept on the way, each in place of the one before.
             offline: True goes on when the server does not answer at the start, and sends everything later; when
                 omitted, as the variable `AVP_MLFLOW_OFFLINE` says.
@@ -225,6 +226,8 @@ class MLflowCallback(BaseCallback):
 
     def _save_model(self, run: TrackedRun) -> None:
         if self._log_model:
+            if (normalised := self.model.get_vec_normalize_env()) is not None:
+                run.save(STATISTICS_FILE, lambda file: normalised.save(str(file)))
             run.save(MODEL_FILE, self.model.save)
 
     def _save_trajectory(self, run: TrackedRun) -> None:
