@@ -7,9 +7,9 @@ heightfield).
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from avp_habitat.compiled import njit
 from avp_habitat.navigation.heightfield import Heightfield
 from avp_habitat.navigation.settings import NavigationSettings
 
