@@ -28,6 +28,7 @@ from avp_habitat.simulators import SimulatorChoice, open_simulator
 from avp_habitat.simulators.options import add_simulator_options, simulator_choice
 from avp_habitat.tracking.addresses import TrackingError, address_of, shown
 from avp_habitat.tracking.early import open_store
+from avp_habitat.tracking.experiments import DEFAULT_HELP
 from avp_habitat.tracking.looking import about_run
 from avp_habitat.tracking.rollout_run import command_for, rollout_run
 
@@ -130,7 +131,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--experiment",
         metavar="NAME",
-        help="MLflow experiment of the run when that of the policy's training is not there (default: avp)",
+        help=f"MLflow experiment of the run when that of the policy's training is not there (default: {DEFAULT_HELP})",
     )
     return parser
 

@@ -49,7 +49,7 @@ class AVPTrainerConfig(TrainerConfig):
     password in MLFLOW_TRACKING_PASSWORD, since options are written to config.yml."""
     mlflow_experiment: str | None = None
     """MLflow experiment; by default that of the rollout's run, below which this run then appears: the one in which the
-    rollout's policy was trained, else `avp`."""
+    rollout's policy was trained, else MLFLOW_EXPERIMENT_NAME or MLFLOW_EXPERIMENT_ID, else `avp`."""
     rerun: Path | None = None
     """Write a Rerun recording of losses and cameras to this file (.rrd), which must not exist."""
 

@@ -19,11 +19,10 @@ from avp_habitat.rewards import REWARD_NAMES
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.settings import OBSERVATION_NAMES, TaskSettings
 from avp_habitat.simulators.options import add_simulator_options, simulator_choice
+from avp_habitat.tracking.experiments import DEFAULT_HELP
 from avp_habitat.trajectory import Trajectory
 from avp_sb3.evaluation import Contestant, EpisodeResult, PolicyResult, run_episodes
 from avp_sb3.evaluation_report import check_new, table, write_report
-
-EXPERIMENT = "avp"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -53,7 +52,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--stochastic", action="store_true", help="sample a model's actions instead of taking the likeliest")
     add("--trusted", action="store_true", help=TRUSTED)
     add("--out", default=None, type=Path, help="folder of the report (default: runs/evaluation-DATE-TIME)")
-    add("--experiment", default=EXPERIMENT, help="of MLflow (default: %(default)s)")
+    add("--experiment", metavar="NAME", help=f"of MLflow (default: {DEFAULT_HELP})")
     add("--no-mlflow", action="store_true", help="log nothing to MLflow")
     return parser
 
@@ -146,8 +145,8 @@ def _track(results: Sequence[PolicyResult], about: dict[str, Any], options: argp
     # Late: mlflow takes seconds to import.
     from avp_sb3.evaluation_tracking import track_evaluation
 
-    run, store = track_evaluation(results, about, options.out, experiment=options.experiment, **more)
-    print(f"MLflow:  run {run} in experiment {options.experiment!r} at {store}")
+    run, experiment, store = track_evaluation(results, about, options.out, experiment=options.experiment, **more)
+    print(f"MLflow:  run {run} in experiment {experiment!r} at {store}")
 
 
 def _about(

@@ -6,6 +6,7 @@ import logging
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from avp_habitat.errors import UsageError
 from avp_habitat.provenance import flat
-from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, DEFAULT_EXPERIMENT, shown
+from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, shown
 from avp_habitat.tracking.journal import spool_folder
 from avp_habitat.tracking.opening import NewRun, continue_run, join_run, may_continue, start_run
 from avp_habitat.tracking.recovery import recover_in_background
@@ -23,7 +24,7 @@ from avp_habitat.tracking.run import Status, TrackedRun
 from avp_sb3.finished_episodes import finished_episodes
 from avp_sb3.learning import is_learning
 from avp_sb3.mlflow_writer import MLflowWriter
-from avp_sb3.run_facts import hyperparameters, scene_tags, task_settings
+from avp_sb3.run_facts import hyperparameters, run_name, scene_tags, task_settings
 
 if TYPE_CHECKING:
     from avp_habitat.trajectory import Trajectory
@@ -60,7 +61,7 @@ class MLflowCallback(BaseCallback):
 
     def __init__(
         self,
-        experiment: str = DEFAULT_EXPERIMENT,
+        experiment: str | None = None,
         run_name: str | None = None,
         tracking_uri: str | None = None,
         *,
@@ -75,8 +76,9 @@ class MLflowCallback(BaseCallback):
         """Describe the run; nothing is contacted before the training starts.
 
         Args:
-            experiment: MLflow experiment, made when it does not exist. Not used within an active run.
-            run_name: name of the run; MLflow invents one when omitted.
+            experiment: MLflow experiment, made when it does not exist; when omitted, what `mlflow.set_experiment`,
+                `MLFLOW_EXPERIMENT_ID` or `MLFLOW_EXPERIMENT_NAME` say, else `avp`. Not used within an active run.
+            run_name: name of the run; when omitted, algorithm, reward, scene and seed.
             tracking_uri: where runs are kept; when omitted, what `mlflow.set_tracking_uri` or `MLFLOW_TRACKING_URI`
                 say, else `sqlite:///mlflow.db` in the current folder.
             run_id: go on with this run; when omitted, with the model's own if it was interrupted.
@@ -193,7 +195,8 @@ class MLflowCallback(BaseCallback):
         earlier = self._models_run() if self.model.num_timesteps > 0 else None
         if earlier is not None and may_continue(address, earlier):
             return continue_run(address, earlier, offline=self._offline)
-        return start_run(address, self._new, offline=self._offline)
+        name = self._new.name or run_name(self.model, self.training_env)
+        return start_run(address, replace(self._new, name=name), offline=self._offline)
 
     def _models_run(self) -> str | None:
         """The run that trained the model so far."""

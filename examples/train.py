@@ -48,7 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--eval-scene", default=None, nargs="+", metavar="SCENE", help="evaluate in these too, and keep the best model")
     add("--eval-every", default=150_000, type=int, help="environment steps between two evaluations")
     add("--recording", default=None, type=Path, help="the Rerun recording (.rrd) of some episodes; none when omitted")
-    add("--experiment", default="avp", help="of MLflow")
+    add("--experiment", default=None, help="of MLflow (default: MLFLOW_EXPERIMENT_NAME, else avp)")
     add("--run-name", default=None, help="of the MLflow run")
     return parser
 

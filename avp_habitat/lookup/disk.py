@@ -19,11 +19,16 @@ _DIGEST_BYTES = 32
 
 
 def cache_folder() -> Path | None:
-    """Where tables are kept: `$AVP_CACHE`, else `avp` in the user's cache folder; None when `$AVP_CACHE` is empty."""
+    """Where tables are kept: `$AVP_CACHE`, else `avp` in the user's cache folder.
+
+    Returns:
+        None when `$AVP_CACHE` is empty, or the user has no home, as in some containers.
+    """
     chosen = os.environ.get(ENVIRONMENT)
     if chosen is not None:
         return Path(chosen) if chosen else None
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "avp"
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+    return caches / "avp" if caches.is_absolute() else None
 
 
 class TileFiles:

@@ -8,9 +8,9 @@ seen from below: see `_walkable`.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from avp_habitat.compiled import njit
 from avp_habitat.navigation.heightfield import DOWNWARDS, UPWARDS, Heightfield
 from avp_habitat.navigation.settings import NavigationSettings
 

@@ -11,9 +11,9 @@ Source: M. Mononen, Recast Navigation (rasterisation).
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from avp_habitat.compiled import njit
 from avp_habitat.errors import SceneError
 from avp_habitat.navigation.settings import NavigationSettings
 

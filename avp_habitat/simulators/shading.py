@@ -5,9 +5,9 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from avp_habitat.compiled import njit
 from avp_habitat.scenes.mesh import TexturedMesh
 
 _MAX_PROBES = 8
