@@ -1,11 +1,10 @@
 """A rollout folder read for a Rerun recording, with every fault found before anything is written."""
 
 import json
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +22,6 @@ PICTURES = 100
 """Of a rollout, at most."""
 _LONGEST_PX = 640
 _MAP_FILE = "trajectory.png"
-# What Pillow raises for a damaged picture, and for one of a size that only an attack has.
-_DAMAGED = (OSError, SyntaxError, ValueError, EOFError, zlib.error, Image.DecompressionBombError)
-
-_T = TypeVar("_T")
 Progress = Callable[[], Any]
 
 
@@ -67,7 +62,7 @@ def read_contents(rollout: Rollout, *, pictures: int = PICTURES, progress: Progr
             numbers per frame, or the metrics are no finite numbers.
     """
     steps = Steps(_inside(rollout, "steps.csv"), len(rollout.frames))
-    plots, feet, metrics = steps.plots(), steps.feet(), _metrics(rollout)
+    plots, feet, metrics = steps.plots(), steps.feet(), rollout.meta.get("metrics", {})
     width, height = rollout.intrinsics.width, rollout.intrinsics.height
     stride = min(-(-max(width, height) // _LONGEST_PX), width, height)
     camera = _subsampled(rollout.intrinsics, stride)
@@ -88,22 +83,14 @@ def read_contents(rollout: Rollout, *, pictures: int = PICTURES, progress: Progr
 
 def _read_view(view: View, camera: Intrinsics, stride: int) -> tuple[NDArray, NDArray, EncodedView]:
     """Picture, depth in metres, and both compressed."""
-    rgb = _decoded(view.image, images.read_rgb)
-    depth = _decoded(view.depth, images.read_depth)
+    rgb, depth = images.read_rgb(view.image), images.read_depth(view.depth)
     if stride == 1:
-        return rgb, depth, EncodedView(encode_jpeg(rgb), _decoded(view.depth, Path.read_bytes))
+        return rgb, depth, EncodedView(encode_jpeg(rgb), view.depth.read_bytes())
     height, width = camera.height * stride, camera.width * stride
     rgb = np.asarray(Image.fromarray(rgb[:height, :width]).reduce(stride))
     # Depth is picked, not averaged: a mean of two surfaces is none.
     depth = np.ascontiguousarray(depth[stride // 2 : height : stride, stride // 2 : width : stride])
     return rgb, depth, encode_view(rgb, depth)
-
-
-def _decoded(path: Path, read: Callable[[Path], _T]) -> _T:
-    try:
-        return read(path)
-    except _DAMAGED as error:
-        raise RolloutError(f"{path}: expected a readable picture, found a damaged one: {error}") from None
 
 
 def _subsampled(camera: Intrinsics, stride: int) -> Intrinsics:
@@ -124,8 +111,8 @@ def _read_map(rollout: Rollout) -> bytes | None:
     path = _inside(rollout, _MAP_FILE)
     if not path.exists():
         return None
-    _decoded(path, images.read_rgb)
-    return _decoded(path, Path.read_bytes)
+    images.read_rgb(path)
+    return path.read_bytes()
 
 
 def _inside(rollout: Rollout, name: str) -> Path:
@@ -137,17 +124,6 @@ def _inside(rollout: Rollout, name: str) -> Path:
     if not leads_to.is_relative_to(rollout.folder.resolve()):
         raise RolloutError(f"{path}: expected a path inside {rollout.folder}, it leads to {leads_to}")
     return path
-
-
-def _metrics(rollout: Rollout) -> dict[str, float]:
-    found = rollout.meta.get("metrics", {})
-    path = rollout.folder / "rollout.json"
-    if not isinstance(found, dict):
-        raise RolloutError(f"{path}: expected metrics to be an object, found a {type(found).__name__}")
-    for name, value in found.items():
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-            raise RolloutError(f"{path}: expected metrics.{name} to be a finite number, found {value!r}")
-    return {name: float(value) for name, value in found.items()}
 
 
 def _about(rollout: Rollout, metrics: dict[str, float]) -> str:
