@@ -2,11 +2,13 @@
 
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from avp_habitat.errors import RolloutError
 from avp_habitat.png import GREY_16, RGB_8, encode_png
 
 DEPTH_UNIT_M = 0.001
@@ -35,18 +37,28 @@ def write_numbers(path: Path, numbers: NDArray[np.uint16]) -> None:
 
 
 def read_numbers(path: Path) -> NDArray[np.uint16]:
-    """Read a 16-bit grey PNG as `(height, width)` whole numbers."""
-    with Image.open(path) as image:
-        return np.asarray(image).astype(np.uint16)
+    """Read a 16-bit grey PNG as `(height, width)` whole numbers.
+
+    Raises:
+        RolloutError: the picture cannot be decoded; likewise in the other functions that read.
+    """
+    return _decoded(path).astype(np.uint16)
 
 
 def read_rgb(path: Path) -> NDArray[np.uint8]:
     """Read a PNG as `(height, width, 3)` uint8."""
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB"))
+    return _decoded(path, "RGB")
 
 
 def read_depth(path: Path) -> NDArray[np.float32]:
     """Read a depth PNG as `(height, width)` float32 metres, 0.0 where there is none."""
-    with Image.open(path) as image:
-        return np.asarray(image, dtype=np.float32) * np.float32(DEPTH_UNIT_M)
+    return _decoded(path).astype(np.float32) * np.float32(DEPTH_UNIT_M)
+
+
+def _decoded(path: Path, mode: str | None = None) -> NDArray[Any]:
+    try:
+        with Image.open(path, formats=["PNG"]) as image:
+            return np.asarray(image if mode is None else image.convert(mode))
+    except Exception as error:  # Pillow raises a dozen kinds for damaged files
+        reason = str(error) or type(error).__name__
+        raise RolloutError(f"{path}: expected a readable PNG, could not decode it: {reason}") from None

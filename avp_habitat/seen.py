@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from avp_habitat import command
 from avp_habitat.errors import RolloutError, UsageError
-from avp_habitat.rollout import read_rollout
+from avp_habitat.rollout import name_of, read_rollout
 from avp_habitat.rollout_visibility import visibility_of
 from avp_habitat.visibility import ALIKE_DEG, ALIKE_DISTANCE, PARALLAX_DEG, Visibility
 
@@ -73,22 +73,19 @@ def report_on(folder: Path, *, stride: int | None = None) -> Report:
         RolloutError: the rollout is damaged, or no held-out view shows a surface.
     """
     rollout = read_rollout(folder)
-    scene, policy, metrics = (
-        part if isinstance(part, dict) else {} for part in map(rollout.meta.get, ("scene", "policy", "metrics"))
-    )
     found = visibility_of(rollout.frames, rollout.heldout, rollout.intrinsics, stride=stride)
     if not len(found.view):
         raise RolloutError(
             f"{folder}: expected held-out views that show a surface, found {len(rollout.heldout)} held-out views "
             "without any depth; collect it with held-out views"
         )
-    coverage = metrics.get("coverage")
+    coverage = rollout.meta.get("metrics", {}).get("coverage")
     about = {
         "rollout": str(folder),
-        "scene": scene.get("name", ""),
-        "policy": policy.get("name", ""),
+        "scene": name_of(rollout.meta, "scene"),
+        "policy": name_of(rollout.meta, "policy"),
         "views": len(rollout.frames),
-        "coverage": float(coverage) if isinstance(coverage, int | float) else None,
+        "coverage": None if coverage is None else float(coverage),
     }
     return Report(about, found)
 

@@ -230,7 +230,7 @@ DAMAGES = {
     ),
     "NaN focal length": (
         lambda f: edit_json(f / "rollout.json", lambda j: j["camera"].update(fx=float("nan"))),
-        "camera.fx to be a number of pixels above 0, found nan",
+        "camera.fx to be a finite number, found nan",
     ),
     "no width": (lambda f: edit_json(f / "rollout.json", lambda j: j["camera"].pop("width")), "camera.width"),
     "wrong count": (
@@ -277,7 +277,7 @@ DAMAGES = {
     ),
     "a size beyond all numbers": (
         lambda f: edit_json(f / "rollout.json", lambda j: j["camera"].update(fx=10**400)),
-        "camera.fx to be a number of pixels",
+        "camera.fx to be a finite number, found 1000",
     ),
     "nested without end": (lambda f: (f / "rollout.json").write_text("[" * 100_000), "rollout.json: expected JSON"),
     "image cut short": (lambda f: cut_short(f, "images/frame_00002.png"), "frame_00002.png: .* without an end"),
@@ -314,7 +314,7 @@ DAMAGES = {
     ),
     "floor nowhere": (
         lambda f: edit_json(f / "rollout.json", lambda j: j["floor"].update(origin_m=[0, float("nan")])),
-        "floor.origin_m to be x and z in metres",
+        r"floor.origin_m\[1\] to be a finite number, found nan",
     ),
     "floor of no cells": (
         lambda f: edit_json(f / "rollout.json", lambda j: j["floor"].update(cell_m=0)),

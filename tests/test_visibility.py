@@ -372,5 +372,5 @@ def test_a_damaged_depth_picture_is_named(rollout, tmp_path):
     content[200:260] = bytes(60)
     path.write_bytes(content)
     broken = type(found.frames[0])(found.frames[0].image, path, found.frames[0].camera_to_world)
-    with pytest.raises(RolloutError, match=r"frame_00000\.png: expected a PNG with depth, could not decode it"):
+    with pytest.raises(RolloutError, match=r"frame_00000\.png: expected a readable PNG, could not decode it"):
         visibility_of([broken], found.heldout, found.intrinsics)

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from avp_habitat import command
-from avp_habitat.errors import AVPError, RolloutError, UsageError
-from avp_habitat.rollout import read_meta
+from avp_habitat.errors import AVPError, UsageError
+from avp_habitat.rollout import read_rollout
 from avp_habitat.tracking import rollout_facts as facts
 from avp_habitat.tracking.addresses import (
     DEFAULT_ADDRESS,
@@ -112,11 +112,8 @@ class _Rollout:
 
 
 def _read(folder: Path) -> _Rollout:
-    if folder.name == "rollout.json":
-        folder = folder.parent
-    if not folder.is_dir():
-        raise RolloutError(f"{folder}: expected a rollout folder (made by `python -m avp_habitat.collect`), found none")
-    meta = read_meta(folder)
+    rollout = read_rollout(folder)
+    folder, meta = rollout.folder, rollout.meta
     return _Rollout(folder, meta, facts.rollout_id(folder), facts.policy_run_id(folder, meta))
 
 
