@@ -19,6 +19,7 @@ from avp_habitat.scenes.export import export_glb
 from avp_habitat.scenes.loader import Scene, load_scene, scene_digest
 from avp_habitat.scenes.location import locate
 from avp_habitat.scenes.mesh import TexturedMesh
+from avp_habitat.scenes.notices import say_once
 from avp_habitat.scenes.stage_config import Y_UP, Z_UP
 from avp_habitat.simulators.raycast import RaycastSimulator
 
@@ -513,3 +514,9 @@ def test_whatever_a_config_holds_brings_a_scene_or_an_error_of_ours(tmp_path_fac
             continue
         assert asset is not None
         assert asset.resolve().is_relative_to(folder.resolve())
+
+
+def test_what_is_said_of_a_scene_is_said_once(caplog):
+    for text in ("first", "second", "first"):
+        say_once("room.glb", text)
+    assert caplog.messages == ["room.glb: first", "room.glb: second"]
