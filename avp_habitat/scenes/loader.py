@@ -92,14 +92,14 @@ def _digest(location: SceneLocation, files: SceneFiles) -> str:
 
 
 def _read(files: SceneFiles) -> TexturedMesh:
-    if files.path.suffix.lower() in _GLTF:
-        from avp_habitat.scenes.gltf import read_gltf
-
-        mesh = read_gltf(files)
+    suffix = files.path.suffix.lower()
+    if suffix in _GLTF:
+        from avp_habitat.scenes.gltf import read_gltf as read
+    elif suffix == ".ply":
+        from avp_habitat.scenes.ply import read_ply as read
     else:
-        from avp_habitat.scenes.polygon_files import read_polygons
-
-        mesh = read_polygons(files)
+        from avp_habitat.scenes.obj import read_obj as read
+    mesh = read(files)
     _check(mesh, files.path)
     return mesh
 
