@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from avp_habitat.poses import pixel_directions
+from avp_habitat.scenes.location import Frame
 from avp_habitat.simulators.base import Frames
 
 ROOM = np.array([[0.0, 0.0, 0.0], [6.0, 2.6, 3.0]])
@@ -87,6 +88,7 @@ class Corridor:
     version = "1"
     scene = "corridor"
     scene_digest = "c0" * 32
+    scene_frame = Frame()
 
     def __init__(self):
         self.area = CorridorArea()

@@ -14,8 +14,8 @@ class TexturedMesh:
     conversion): scanned scenes carry baked light that is meant to be shown so.
     """
 
-    vertices: NDArray[np.float32]
-    """`(v, 3)` positions in metres."""
+    vertices: NDArray[np.floating]
+    """`(v, 3)` positions in metres, float32; float64 while a file is read, whose coordinates may be large."""
     triangles: NDArray[np.int32]
     """`(t, 3)` vertex indices."""
     uv: NDArray[np.float32]
@@ -37,7 +37,7 @@ class TexturedMesh:
         assert self.texture_index.shape == (triangles,), self.texture_index.shape
 
     @property
-    def bounds(self) -> NDArray[np.float32]:
+    def bounds(self) -> NDArray[np.floating]:
         """`(2, 3)` least and greatest corner in metres."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 

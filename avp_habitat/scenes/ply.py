@@ -249,7 +249,7 @@ def _together(columns: _Columns, names: tuple[str, ...]) -> NDArray[np.float64] 
 
 
 def _colours(columns: _Columns) -> NDArray[np.float32] | None:
-    """`(rows, 3)` in [0, 1]: whole numbers are shares of 255, or of 65535 where one is greater, floats of 1, or of 255."""
+    """`(rows, 3)` in [0, 1]: whole numbers are shares of 255, or of 65535 if one is greater; floats of 1, or of 255."""
     for names in _COLOURS:
         stored = _together(columns, names)
         if stored is not None and len(stored):
