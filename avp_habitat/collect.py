@@ -37,7 +37,7 @@ from avp_habitat.tracking.rollout_run import command_for, rollout_run
 class Request:
     """What to collect."""
 
-    scene: str
+    scene: str | Path
     """As `avp_habitat.scenes.location.locate` takes it."""
     policy: str
     """A baseline's name, or a PPO model (`.zip`)."""

@@ -1,5 +1,6 @@
 """`AVP-v0`: the task for one agent as a Gymnasium environment."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,11 +38,12 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
 
     def __init__(
         self,
-        scene: str = "builtin:0",
+        scene: str | Path = "builtin:0",
         *,
         simulator: str | Simulator = "raycast",
         gpu: int | None = None,
         navmesh: str | Path | None = None,
+        up: str | None = None,
         render_mode: str | None = None,
         settings: TaskSettings | None = None,
         **overrides: Any,
@@ -53,6 +55,7 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
             simulator: `raycast`, `habitat`, or one that is open already (the scene's name is then its own).
             gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
             navmesh: file of the scene's NavMesh; computed when omitted.
+            up: axis of mesh files that points up, `y` or `z`; of each file what is known of it when omitted.
             render_mode: None, or `rgb_array`: the camera's picture beside the top-down map.
             settings: of the task; the design's defaults when omitted.
             **overrides: single fields of `TaskSettings`, for example `reward="coverage"`, `budget=60`, `width=64`.
@@ -65,14 +68,14 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise unknown_name("render_mode", render_mode, RENDER_MODES)
         self.settings = _with_overrides(settings or TaskSettings(), overrides)
-        self.choice = SimulatorChoice.unless_open(simulator, gpu=gpu, navmesh=navmesh)
+        self.choice = SimulatorChoice.unless_open(simulator, gpu=gpu, navmesh=navmesh, up=up)
         """How the simulator was chosen; None for one that was open already."""
         self.render_mode = render_mode
         self.observation_space = observation_space(self.settings.observation)
         self.action_space = action_space()
         self._enter(scene, simulator)
 
-    def change_scene(self, scene: str) -> None:
+    def change_scene(self, scene: str | Path) -> None:
         """Leave the scene for another one in the same kind of simulator; `reset` starts there.
 
         Args:
@@ -182,11 +185,11 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         """End the episode; the simulator is shared and goes with its last user."""
         self._running = False
 
-    def _enter(self, scene: str, simulator: str | Simulator) -> None:
+    def _enter(self, scene: str | Path, simulator: str | Simulator) -> None:
         if self.choice is not None:
             simulator = open_simulator(self.choice, scene)
         assert not isinstance(simulator, str)
-        self.scene = scene
+        self.scene = os.fspath(scene)
         """As given."""
         self.simulator = simulator
         self.area = simulator.area
@@ -236,6 +239,8 @@ def _with_overrides(settings: TaskSettings, overrides: dict[str, Any]) -> TaskSe
     for name in overrides:
         if name not in TaskSettings.__dataclass_fields__:
             raise unknown_name(
-                "AVP-v0 option", name, ["scene", "simulator", "gpu", "navmesh", *TaskSettings.__dataclass_fields__]
+                "AVP-v0 option",
+                name,
+                ["scene", "simulator", "gpu", "navmesh", "up", *TaskSettings.__dataclass_fields__],
             )
     return replace(settings, **overrides)

@@ -136,7 +136,7 @@ def _step_row(env: AVPEnv, action: int, reward: float, info: dict[str, Any]) -> 
 def _scene_and_task(env: AVPEnv, heldout: int) -> dict[str, Any]:
     settings, area = env.settings, env.area
     return {
-        "scene": {"name": env.scene_name, "sha256": env.scene_digest},
+        "scene": {"name": env.scene_name, "sha256": env.scene_digest, **asdict(env.simulator.scene_frame)},
         "simulator": {"name": env.simulator.name, "version": env.simulator.version},
         "reward": settings.reward,
         "reward_constants": asdict(settings.constants),

@@ -10,15 +10,17 @@ from pathlib import Path
 from avp_habitat import command
 from avp_habitat.errors import SceneError, UsageError
 from avp_habitat.scenes.location import HELP
+from avp_habitat.simulators.options import add_up_option
 
 
-def save_navmesh(scene: str, out: Path, *, gpu: int | None = None) -> float:
+def save_navmesh(scene: str | Path, out: Path, *, gpu: int | None = None, up: str | None = None) -> float:
     """Compute a scene's NavMesh for the task's agent and write it.
 
     Args:
         scene: as for `avp_habitat.scenes.location.locate`.
         out: the file; appears only when it is complete.
         gpu: CUDA device for Habitat-Sim, see `HabitatSimulator`.
+        up: axis of a mesh file that points up, `y` or `z`.
 
     Returns:
         The navigable area in square metres.
@@ -36,7 +38,7 @@ def save_navmesh(scene: str, out: Path, *, gpu: int | None = None) -> float:
         raise UsageError(f"{out}: there is no folder {out.parent}")
     from avp_habitat.simulators.habitat import HabitatSimulator
 
-    simulator = HabitatSimulator(scene, gpu=gpu)
+    simulator = HabitatSimulator(scene, gpu=gpu, up=up)
     try:
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
             made = Path(folder) / out.name
@@ -61,8 +63,9 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument(
         "--gpu", type=int, metavar="N", help="CUDA device, -1 for none (default: the first one there is)"
     )
+    add_up_option(parser)
     options = parser.parse_args(argv)
-    area = save_navmesh(options.scene, options.out, gpu=options.gpu)
+    area = save_navmesh(options.scene, options.out, gpu=options.gpu, up=options.up)
     print(f"{options.out}: {area:.2f} m² navigable; give it to both simulators by --navmesh {options.out}")
 
 

@@ -84,6 +84,7 @@ def main(argv: Sequence[str]) -> None:
             simulator=choice.name,
             gpu=choice.gpu,
             navmesh=choice.navmesh,
+            up=choice.up,
             observation=options.observation,
             stochastic=options.stochastic,
             trusted=options.trusted,

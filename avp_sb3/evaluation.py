@@ -78,12 +78,13 @@ class Contestant:
     def __init__(
         self,
         policy: str,
-        scene: str,
+        scene: str | Path,
         settings: TaskSettings,
         *,
         simulator: str = "raycast",
         gpu: int | None = None,
         navmesh: str | Path | None = None,
+        up: str | None = None,
         observation: str | None = None,
         stochastic: bool = False,
         trusted: bool = False,
@@ -97,6 +98,7 @@ class Contestant:
             simulator: the simulator's name.
             gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
             navmesh: file of the scene's NavMesh; computed when omitted.
+            up: axis of a mesh file that points up, `y` or `z`; what is known of the file when omitted.
             observation: kind of observation; what the model was trained on when omitted.
             stochastic: sample a model's actions instead of taking the likeliest.
             trusted: open a model's file also where that may run code which the file holds.
@@ -111,7 +113,7 @@ class Contestant:
         self.trajectory: Trajectory | None = None
         """Of the last episode that ended."""
         self._stochastic = stochastic
-        opened = make_simulator(simulator, scene, gpu=gpu, navmesh=navmesh)
+        opened = make_simulator(simulator, scene, gpu=gpu, navmesh=navmesh, up=up)
         self.env, self._policy = make_policy_env(
             policy, opened, replace(settings, lookup=False), observation=observation, trusted=trusted
         )
@@ -149,7 +151,7 @@ class Contestant:
 
 def evaluate_policy(
     policy: str,
-    scene: str,
+    scene: str | Path,
     *,
     episodes: int = 20,
     seed: int = 1000,
@@ -166,7 +168,7 @@ def evaluate_policy(
         seed: of the first episode.
         settings: of the task; the design's defaults when omitted. Visibility is always computed, never looked up.
         on_episode: called after each episode.
-        **options: `simulator`, `gpu`, `navmesh`, `observation`, `stochastic` and `trusted` of `Contestant`.
+        **options: `simulator`, `gpu`, `navmesh`, `up`, `observation`, `stochastic` and `trusted` of `Contestant`.
 
     Raises:
         AVPError: as `Contestant`.

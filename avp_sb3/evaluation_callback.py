@@ -53,7 +53,7 @@ class EvaluationCallback(BaseCallback):
 
     def __init__(
         self,
-        scenes: str | Sequence[str] | None = None,
+        scenes: str | Path | Sequence[str | Path] | None = None,
         *,
         eval_env: VecEnv | None = None,
         every: int = DEFAULT_EVERY,
@@ -67,6 +67,7 @@ class EvaluationCallback(BaseCallback):
         simulator: str = "raycast",
         gpu: int | None = None,
         navmesh: str | Path | None = None,
+        up: str | None = None,
         verbose: int = 0,
     ) -> None:
         """Describe the evaluation; scenes are opened when the training starts.
@@ -91,6 +92,7 @@ class EvaluationCallback(BaseCallback):
             simulator: that opens the scenes; with `habitat` each of them is in a process of its own.
             gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
             navmesh: file of the only scene's NavMesh; computed when omitted.
+            up: axis of mesh files that points up, `y` or `z`; of each file what is known of it when omitted.
             verbose: 1 prints when a better model is kept.
 
         Raises:
@@ -107,7 +109,8 @@ class EvaluationCallback(BaseCallback):
         self._agents: dict[str, list[int]] = {}
         self._every, self._episodes, self._seed = every, episodes, seed
         self._deterministic, self._at_start, self._score = deterministic, at_start, score
-        self._settings, self._choice = settings, SimulatorChoice.of(simulator, gpu=gpu, navmesh=navmesh)
+        self._settings = settings
+        self._choice = SimulatorChoice.of(simulator, gpu=gpu, navmesh=navmesh, up=up)
         self._best = BestModel(best_model, score)
         self._due = 0
         self._evaluated_at: int | None = None
@@ -220,9 +223,12 @@ class EvaluationCallback(BaseCallback):
             print(f"{path}: the best model so far, {self._score} {value:.4g} after {self.num_timesteps} steps")
 
 
-def _scenes(scenes: str | Sequence[str] | None, env: VecEnv | None, settings: TaskSettings | None) -> tuple[str, ...]:
+def _scenes(
+    scenes: str | Path | Sequence[str | Path] | None, env: VecEnv | None, settings: TaskSettings | None
+) -> tuple[str, ...]:
     if env is None:
-        found = DEFAULT_SCENES if scenes is None else (scenes,) if isinstance(scenes, str) else tuple(scenes)
+        given = DEFAULT_SCENES if scenes is None else [scenes] if isinstance(scenes, (str, Path)) else scenes
+        found = tuple(map(str, given))
         if not found:
             raise UsageError(f"{READER} scenes: expected at least one, got none")
         if repeated := {scene for scene in found if found.count(scene) > 1}:

@@ -1,6 +1,7 @@
 """Environments whose episodes start from the same places each time: one agent for each episode in each scene."""
 
 from collections.abc import Sequence
+from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -13,21 +14,18 @@ from avp_sb3.vec_env import AVPVecEnv
 class FixedStarts(AVPVecEnv):
     """One agent for each episode in each of some scenes; seeded, episode i of every scene starts from `seed + i`."""
 
-    def __init__(self, scenes: Sequence[str], *, episodes: int, simulator: str, settings: TaskSettings) -> None:
+    def __init__(self, scenes: Sequence[str], *, episodes: int, **options: Any) -> None:
         """Open the scenes.
 
         Args:
             scenes: each as `avp_habitat.scenes.location.locate` takes it.
             episodes: in each scene.
-            simulator: the simulator's name.
-            settings: of the task.
+            **options: of `AVPVecEnv`.
 
         Raises:
-            UsageError: more agents than memory allows, or an unknown name.
-            SceneError: a scene cannot be used.
-            SimulatorError: the simulator cannot run here.
+            AVPError: as `AVPVecEnv`.
         """
-        super().__init__(list(scenes), agents=episodes * len(scenes), simulator=simulator, settings=settings)
+        super().__init__(list(scenes), agents=episodes * len(scenes), **options)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed the starts of the next `reset`."""
@@ -58,16 +56,10 @@ def fixed_starts(scenes: Sequence[str], choice: SimulatorChoice, *, episodes: in
     Raises:
         AVPError: as `AVPVecEnv` and `AVPSubprocVecEnv`.
     """
+    options = {"simulator": choice.name, "gpu": choice.gpu, "navmesh": choice.navmesh, "up": choice.up}
     if choice.name not in ONE_PER_PROCESS:
-        return FixedStarts(scenes, episodes=episodes, simulator=choice.name, settings=settings)
-    return FixedStartsInProcesses(
-        list(scenes),
-        agents=episodes * len(scenes),
-        simulator=choice.name,
-        gpu=choice.gpu,
-        navmesh=choice.navmesh,
-        settings=settings,
-    )
+        return FixedStarts(scenes, episodes=episodes, settings=settings, **options)
+    return FixedStartsInProcesses(list(scenes), agents=episodes * len(scenes), settings=settings, **options)
 
 
 def _starts(seed: int, agents: int, scenes: int) -> list[int | None]:

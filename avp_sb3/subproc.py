@@ -35,13 +35,14 @@ class AVPSubprocVecEnv(VecEnv):
 
     def __init__(
         self,
-        scene: str | Sequence[str] = "builtin:0",
+        scene: str | Path | Sequence[str | Path] = "builtin:0",
         *,
         agents: int | None = None,
         workers: int | None = None,
         simulator: str = "raycast",
         gpu: int | Sequence[int] | None = None,
         navmesh: str | Path | None = None,
+        up: str | None = None,
         settings: TaskSettings | None = None,
         seed: int | None = None,
         start_method: str = "forkserver",
@@ -58,6 +59,7 @@ class AVPSubprocVecEnv(VecEnv):
             gpu: the CUDA device of `habitat`, or several, of which worker i takes number i modulo their number; -1
                 for none, None for the first one there is.
             navmesh: file of the only scene's NavMesh; computed when omitted.
+            up: axis of mesh files that points up, `y` or `z`; of each file what is known of it when omitted.
             settings: of the task; when omitted, the design's defaults, looked up where the simulator casts rays.
             seed: of the starts; agent i uses `seed + i`.
             start_method: `forkserver` or `spawn`.
@@ -68,7 +70,7 @@ class AVPSubprocVecEnv(VecEnv):
             SimulatorError: the simulator cannot run here, or a worker ended.
         """
         gpus = list(gpu) if isinstance(gpu, Sequence) else [gpu]
-        choices = [SimulatorChoice.of(simulator, gpu=each, navmesh=navmesh) for each in gpus]
+        choices = [SimulatorChoice.of(simulator, gpu=each, navmesh=navmesh, up=up) for each in gpus]
         if not choices:
             raise UsageError("gpu: expected at least one, got none")
         self.scenes = scenes_given(scene, choices[0])

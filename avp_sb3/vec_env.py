@@ -30,12 +30,13 @@ class AVPVecEnv(VecEnv):
 
     def __init__(
         self,
-        scene: str | Sequence[str] = "builtin:0",
+        scene: str | Path | Sequence[str | Path] = "builtin:0",
         *,
         agents: int = 16,
         simulator: str | Simulator | Sequence[Simulator] = "raycast",
         gpu: int | None = None,
         navmesh: str | Path | None = None,
+        up: str | None = None,
         settings: TaskSettings | None = None,
         seed: int | None = None,
     ) -> None:
@@ -48,6 +49,7 @@ class AVPVecEnv(VecEnv):
             simulator: a simulator's name, or those that are open already, one for each scene (names are then theirs).
             gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
             navmesh: file of the only scene's NavMesh; computed when omitted.
+            up: axis of mesh files that points up, `y` or `z`; of each file what is known of it when omitted.
             settings: of the task; when omitted, the design's defaults, looked up where the simulator casts rays.
             seed: of the starts; agent i uses `seed + i`, as SB3 seeds separate environments.
 
@@ -56,7 +58,7 @@ class AVPVecEnv(VecEnv):
             SceneError: a scene cannot be used; the text names it.
             SimulatorError: the simulator cannot run here, or several scenes need a process each (`AVPSubprocVecEnv`).
         """
-        self.simulators = _open(scene, simulator, gpu=gpu, navmesh=navmesh)
+        self.simulators = _open(scene, simulator, gpu=gpu, navmesh=navmesh, up=up)
         casts = all(each.name == "raycast" for each in self.simulators)
         self.settings = settings or TaskSettings(lookup=casts)
         if agents < len(self.simulators):
@@ -170,7 +172,7 @@ def _check_memory(agents: int, simulators: Sequence[Simulator], settings: TaskSe
 
 
 def _open(
-    scene: str | Sequence[str], simulator: str | Simulator | Sequence[Simulator], **options: Any
+    scene: str | Path | Sequence[str | Path], simulator: str | Simulator | Sequence[Simulator], **options: Any
 ) -> list[Simulator]:
     choice = SimulatorChoice.unless_open(simulator, **options)
     if choice is None:
@@ -184,13 +186,13 @@ def _open(
     return [open_simulator(choice, name) for name in scenes]
 
 
-def scenes_given(scene: str | Sequence[str], choice: SimulatorChoice) -> list[str]:
-    """The scenes as a list.
+def scenes_given(scene: str | Path | Sequence[str | Path], choice: SimulatorChoice) -> list[str]:
+    """The scenes as a list of strings.
 
     Raises:
         UsageError: there are none, or several for one NavMesh.
     """
-    scenes = [scene] if isinstance(scene, str) else list(scene)
+    scenes = list(map(str, [scene] if isinstance(scene, (str, Path)) else scene))
     if not scenes:
         raise UsageError("scene: expected at least one, got none")
     if choice.navmesh is not None and len(scenes) > 1:

@@ -94,6 +94,7 @@ def _open(order: Order) -> "AVPVecEnv":
         simulator=choice.name,
         gpu=choice.gpu,
         navmesh=choice.navmesh,
+        up=choice.up,
         settings=order.settings,
     )
 

@@ -22,7 +22,7 @@ _WITH_LOOKUP = "raycast"
 _HOOK = "avp_sb3.zoo.Batched"
 
 
-def Batched(venv: VecEnv, *, scenes: Sequence[str] = (), lookup: bool = True) -> VecEnv:
+def Batched(venv: VecEnv, *, scenes: Sequence[str | Path] = (), lookup: bool = True) -> VecEnv:
     """The same agents as one `AVPVecEnv` within a `VecMonitor`: same scenes, settings and starts, stepped as arrays.
 
     Left as they are: those that are rendered, recorded or wrapped otherwise, because a batch would leave that out, and
@@ -60,7 +60,7 @@ def Batched(venv: VecEnv, *, scenes: Sequence[str] = (), lookup: bool = True) ->
     return VecMonitor(batch, filename=folder)
 
 
-def _left_alone(venv: VecEnv, reason: str, scenes: Sequence[str]) -> VecEnv:
+def _left_alone(venv: VecEnv, reason: str, scenes: Sequence[str | Path]) -> VecEnv:
     if scenes and venv.num_envs > 1:
         raise UsageError(f"{_HOOK}: scenes: expected environments that can be stepped as one batch, but {reason}")
     print(f"{_HOOK}: the environments are stepped one by one: {reason}")
@@ -101,7 +101,7 @@ def _settings(envs: list[AVPEnv], *, lookup: bool) -> TaskSettings:
     return replace(settings, lookup=lookup and rays)
 
 
-def _simulators(envs: list[AVPEnv], scenes: Sequence[str]) -> list[Simulator]:
+def _simulators(envs: list[AVPEnv], scenes: Sequence[str | Path]) -> list[Simulator]:
     own = [env.simulator for env in envs]
     if not scenes or len(envs) == 1:
         return _shortest_cycle(own)

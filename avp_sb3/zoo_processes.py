@@ -1,7 +1,9 @@
 """Stable-Baselines3's `SubprocVecEnv` with workers that are watched: what fails in them is told by name."""
 
+import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.vec_env import SubprocVecEnv
@@ -25,7 +27,7 @@ class WatchedProcesses(VecEnvWrapper):
 
     venv: SubprocVecEnv
 
-    def __init__(self, venv: SubprocVecEnv, scenes: Sequence[str] = (), *, reader: str) -> None:
+    def __init__(self, venv: SubprocVecEnv, scenes: Sequence[str | Path] = (), *, reader: str) -> None:
         """Ask the workers whether their scenes are open.
 
         Args:
@@ -114,7 +116,7 @@ class WatchedProcesses(VecEnvWrapper):
             if failure is not None:
                 raise Failure(*failure).error(self._name(worker))
 
-    def _spread(self, scenes: Sequence[str], reader: str) -> None:
+    def _spread(self, scenes: Sequence[str | Path], reader: str) -> None:
         if not scenes:
             return
         count = self.venv.num_envs
@@ -125,7 +127,7 @@ class WatchedProcesses(VecEnvWrapper):
         for scene in scenes:
             locate(scene)  # Here, a missing one is an error of its own, there it would end the worker.
         for worker in range(count):
-            scene = self._names[worker] = scenes[worker % len(scenes)]
+            scene = self._names[worker] = os.fspath(scenes[worker % len(scenes)])
             self._watched(lambda: self.venv.env_method("change_scene", scene, indices=worker))  # noqa: B023
 
     def _watched(self, work: Callable[[], Any]) -> Any:

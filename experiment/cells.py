@@ -91,7 +91,7 @@ def _training(configuration: Configuration, root: Path, method: Method, seed: in
     words = ["python", "examples/train.py", "--scene", *(configuration.rooms if method.rooms else scenes)]
     words += ["--reward", method.reward, "--observation", observation, "--seed", str(seed)]
     words += ["--steps", str(preset.steps_rooms if method.rooms else preset.steps)]
-    words += ["--simulator", configuration.simulator, "--out", str(model)]
+    words += [*configuration.simulator_options, "--out", str(model)]
     words += ["--experiment", tracking, "--run-name", f"{method.name} (seed {seed})"]
     return Cell(TRAIN, name, tuple(words), model.name, method, seed, resumes=True)
 
@@ -123,7 +123,7 @@ def _rollout(
     words = ["python", "-m", "avp_habitat.collect", "--scene", scene.spec, *policy, "--reward", method.reward]
     # Every method starts at the same places.
     words += ["--seed", str(START_SEEDS * (1 + start) + seed), "--budget", str(preset.budget)]
-    words += ["--width", str(width), "--height", str(height), "--simulator", configuration.simulator]
+    words += ["--width", str(width), "--height", str(height), *configuration.simulator_options]
     words += ["--out", str(out), "--mlflow", "off"]
     return Cell(COLLECT, name, tuple(words), out.name, method, seed, scene, start, needs=training)
 

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
 from avp_habitat.heldout import VIEWS
-from avp_habitat.simulators import ONE_PER_PROCESS, SIMULATOR_NAMES
+from avp_habitat.simulators import ONE_PER_PROCESS, SIMULATOR_NAMES, SimulatorChoice
+from avp_habitat.simulators.options import add_up_option
 from experiment.cells import Cell, plan
 from experiment.configuration import Configuration, keep, read_scenes
 from experiment.methods import DEFAULT, METHODS, chosen_methods
@@ -51,6 +52,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--starts", default=AUTO, help="episodes of each method, scene and seed; auto: the preset's")
     add("--methods", default=AUTO, help=f"with commas between, of {', '.join(METHODS)}; auto: {', '.join(DEFAULT)}")
     add("--simulator", default="raycast", help=f"{', '.join(SIMULATOR_NAMES)} (default: %(default)s)")
+    add_up_option(parser)
     add(
         "--out",
         default=AUTO,
@@ -77,9 +79,10 @@ def read_options(argv: Sequence[str]) -> Options:
     if given.simulator not in SIMULATOR_NAMES:
         raise unknown_name("simulator", given.simulator, SIMULATOR_NAMES)
     unseen = [] if given.unseen == NONE else _split(given.unseen)
-    scenes = read_scenes(_split(given.scene), unseen, given.simulator)
+    scenes = read_scenes(_split(given.scene), unseen, SimulatorChoice(given.simulator, up=given.up))
     out = Path("runs") / f"experiment-{given.preset}" if given.out == AUTO else Path(given.out)
-    return Options(Configuration(given.preset, preset, seeds, scenes, methods, given.simulator), out, jobs)
+    configuration = Configuration(given.preset, preset, seeds, scenes, methods, given.simulator, given.up)
+    return Options(configuration, out, jobs)
 
 
 def _split(text: str) -> list[str]:

@@ -56,6 +56,8 @@ class Configuration:
     """Compared."""
     simulator: str = "raycast"
     """The simulator's name."""
+    up: str | None = None
+    """Axis of mesh files that points up; the scenes' digests cover it."""
 
     @property
     def rooms(self) -> tuple[str, ...]:
@@ -63,6 +65,11 @@ class Configuration:
         taken = {scene.name for scene in self.scenes}
         seeds = range(_FIRST_ROOM, _FIRST_ROOM + self.preset.rooms + len(taken))
         return tuple([room for seed in seeds if (room := f"builtin:{seed}") not in taken][: self.preset.rooms])
+
+    @property
+    def simulator_options(self) -> tuple[str, ...]:
+        """The options of commands that open a scene."""
+        return ("--simulator", self.simulator, *(("--up", self.up) if self.up else ()))
 
     def as_json(self) -> dict[str, Any]:
         """Scenes, preset and its values as the results state them."""
@@ -74,7 +81,7 @@ class Configuration:
         return {"preset": self.preset_name, **values, "simulator": self.simulator, "scenes": scenes}
 
 
-def read_scenes(train: Sequence[str], unseen: Sequence[str], simulator: str) -> tuple[Scene, ...]:
+def read_scenes(train: Sequence[str], unseen: Sequence[str], choice: SimulatorChoice) -> tuple[Scene, ...]:
     """Open every scene once, so that one that cannot be used is named before anything long begins.
 
     Raises:
@@ -86,7 +93,7 @@ def read_scenes(train: Sequence[str], unseen: Sequence[str], simulator: str) -> 
     found: list[Scene] = []
     for role, specs in (("train", train), ("unseen", unseen)):
         for spec in specs:
-            opened = open_simulator(SimulatorChoice(simulator), spec)
+            opened = open_simulator(choice, spec)
             _ = opened.area
             scene = Scene(spec, opened.scene, opened.scene_digest, role)
             opened.close()

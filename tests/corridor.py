@@ -10,6 +10,7 @@ import numpy as np
 
 from avp_habitat.coverage import pairs_in_image
 from avp_habitat.poses import pixel_directions
+from avp_habitat.scenes.location import Frame
 from avp_habitat.simulators.base import Frames
 
 ROOM = np.array([[0.0, 0.0, 0.0], [6.0, 2.6, 3.0]])
@@ -96,6 +97,7 @@ class Corridor:
     version = "1"
     scene = "corridor"
     scene_digest = "c0" * 32
+    scene_frame = Frame()
 
     def __init__(self):
         self.area = CorridorArea()

@@ -15,6 +15,7 @@ from avp_habitat.errors import SceneError, UsageError
 from avp_habitat.scenes.loader import load_scene
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.scenes.mesh import TexturedMesh
+from avp_habitat.simulators.options import add_up_option
 
 _UNLIT = "KHR_materials_unlit"
 _FLOAT, _UINT32 = 5126, 5125
@@ -159,8 +160,9 @@ def main(argv: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(prog="python -m avp_habitat.scenes.export", description=main.__doc__)
     parser.add_argument("scene", help=SCENES)
     parser.add_argument("out", type=Path, help="the .glb file to write; must not exist")
+    add_up_option(parser)
     arguments = parser.parse_args(argv)
-    export_glb(load_scene(arguments.scene).mesh, arguments.out)
+    export_glb(load_scene(arguments.scene, up=arguments.up).mesh, arguments.out)
     print(f"wrote {arguments.out}")
 
 

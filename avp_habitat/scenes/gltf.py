@@ -129,7 +129,7 @@ class _Reader:
         if "KHR_draco_mesh_compression" in (primitive.extensions or {}) and not self._has_data(attributes.POSITION):
             raise SceneError(f"{self._path}: uses KHR_draco_mesh_compression, which is not supported")
         local = self._buffers.array(attributes.POSITION).astype(np.float64)
-        vertices = (local @ to_world[:3, :3].T + to_world[:3, 3]).astype(np.float32)
+        vertices = local @ to_world[:3, :3].T + to_world[:3, 3]
         surface = self._surface(primitive.material)
         triangles = self._triangles(primitive.indices, mode, len(vertices))
         if np.linalg.det(to_world[:3, :3]) < 0:

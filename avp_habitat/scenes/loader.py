@@ -1,16 +1,16 @@
 """From what the user calls a scene to its mesh in the world."""
 
 import hashlib
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from avp_habitat.errors import SceneError
-from avp_habitat.poses import axes_to_world
 from avp_habitat.scenes.files import SceneFiles
-from avp_habitat.scenes.location import BUILTIN, SceneLocation, locate
+from avp_habitat.scenes.location import BUILTIN, Frame, SceneLocation, locate
 from avp_habitat.scenes.mesh import TexturedMesh
+from avp_habitat.scenes.notices import say_once
+from avp_habitat.scenes.placing import check_numbers, looks_z_up, lost_mm, place
 from avp_habitat.scenes.stage_config import Y_UP
 
 _GLTF = (".glb", ".gltf")
@@ -26,20 +26,29 @@ class Scene:
     """Hexadecimal SHA-256 of the content; see `scene_digest`."""
     mesh: TexturedMesh
     """Its surfaces, world frame, metres."""
+    frame: Frame = field(default_factory=Frame)
+    """How the file lies in the world."""
 
 
-def load_scene(spec: str) -> Scene:
+def load_scene(spec: str | Path, *, up: str | None = None, origin: Sequence[float] | None = None) -> Scene:
     """Load a scene.
 
     Args:
         spec: a mesh (metres), a scene of Replica or of a scene dataset config, or `builtin:SEED` for a generated room;
             `avp_habitat.scenes.location.locate` says what can be written.
+        up: axis of a mesh file that points up, `y` or `z`.
+        origin: `(3,)` taken off the file's coordinates, turned to Y up, as a rollout of the scene says it; chosen here
+            when omitted.
 
     Raises:
         UsageError: nothing that a scene could be called.
         SceneError: the scene is missing, damaged, holds no triangle, or has objects, which only Habitat-Sim shows.
     """
-    location = locate(spec)
+    return load_located(locate(spec, up=up), origin=origin)
+
+
+def load_located(location: SceneLocation, *, origin: Sequence[float] | None = None) -> Scene:
+    """Load a scene that was located; arguments and errors as of `load_scene`."""
     if location.asset is None:
         from avp_habitat.scenes.builtin import generate_room
 
@@ -50,15 +59,16 @@ def load_scene(spec: str) -> Scene:
             "does not show; use --simulator habitat"
         )
     files = SceneFiles(location.asset)
-    mesh = _to_world(_read(files), location)
-    return Scene(location.name, _digest(location, files), mesh)
+    mesh, frame = _placed(_read(files), location, origin)
+    return Scene(location.name, _digest(location, files), mesh, frame)
 
 
-def scene_digest(location: SceneLocation) -> str:
-    """Hexadecimal SHA-256 of what a scene is made of, the same as that of the loaded scene.
+def identify(location: SceneLocation) -> tuple[str, Frame]:
+    """Digest and frame of a scene, the same as those of the loaded scene.
 
-    It covers the mesh and the files that it refers to; where a scene has configs or axes other than Y up, -Z front,
-    those too (of objects, the config that names them); of a generated room the seed and the generator's version.
+    The digest is the hexadecimal SHA-256 of what the scene is made of: of the mesh and the files that it refers to;
+    where a scene has configs or axes other than Y up, -Z front, of those too (of objects, the config that names them);
+    of a generated room of the seed and the generator's version.
 
     Raises:
         SceneError: the mesh is damaged, or holds no triangle.
@@ -66,15 +76,22 @@ def scene_digest(location: SceneLocation) -> str:
     if location.asset is None:
         from avp_habitat.scenes.builtin import GENERATOR_VERSION
 
-        return hashlib.sha256(f"{BUILTIN}{_seed(location)}:v{GENERATOR_VERSION}".encode()).hexdigest()
+        text = f"{BUILTIN}{_seed(location)}:v{GENERATOR_VERSION}"
+        return hashlib.sha256(text.encode()).hexdigest(), Frame()
     files = SceneFiles(location.asset)
+    frame = Frame(up=location.told_up)
     try:
-        _read(files)
+        frame = _placed(_read(files), location)[1]
     except SceneError as error:
         # The textures of HM3D, which only Habitat-Sim reads; they are part of the file itself.
         if "KHR_texture_basisu" not in str(error):
             raise
-    return _digest(location, files)
+    return _digest(location, files), frame
+
+
+def scene_digest(location: SceneLocation) -> str:
+    """The digest alone of `identify`."""
+    return identify(location)[0]
 
 
 def _seed(location: SceneLocation) -> int:
@@ -92,36 +109,33 @@ def _digest(location: SceneLocation, files: SceneFiles) -> str:
 
 
 def _read(files: SceneFiles) -> TexturedMesh:
-    if files.path.suffix.lower() in _GLTF:
-        from avp_habitat.scenes.gltf import read_gltf
-
-        mesh = read_gltf(files)
+    suffix = files.path.suffix.lower()
+    if suffix in _GLTF:
+        from avp_habitat.scenes.gltf import read_gltf as read
+    elif suffix == ".ply":
+        from avp_habitat.scenes.ply import read_ply as read
     else:
-        from avp_habitat.scenes.polygon_files import read_polygons
-
-        mesh = read_polygons(files)
-    _check(mesh, files.path)
+        from avp_habitat.scenes.obj import read_obj as read
+    mesh = read(files)
+    check_numbers(mesh, files.path)
     return mesh
 
 
-def _to_world(mesh: TexturedMesh, location: SceneLocation) -> TexturedMesh:
-    """The mesh turned from its file's axes; written out, because BLAS may add in another order on other machines."""
-    if (location.up, location.front) == Y_UP:
-        return mesh
-    x, y, z = mesh.vertices.astype(np.float64).T
-    rows = axes_to_world(location.up, location.front)
-    turned = np.stack([row[0] * x + row[1] * y + row[2] * z for row in rows], axis=1)
-    return replace(mesh, vertices=turned.astype(np.float32))
-
-
-def _check(mesh: TexturedMesh, path: Path) -> None:
-    """Refuse what a renderer could not use."""
-    if not len(mesh.triangles):
-        raise SceneError(f"{path}: expected a mesh with triangles, found none")
-    for name, values in (("position", mesh.vertices), ("texture coordinate", mesh.uv), ("colour", mesh.colours)):
-        wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
-        if len(wrong):
-            raise SceneError(
-                f"{path}: expected finite numbers, but {len(wrong)} of {len(values)} vertices have a {name} that "
-                f"is NaN or infinite (the first is vertex {wrong[0]})"
-            )
+def _placed(
+    mesh: TexturedMesh, location: SceneLocation, origin: Sequence[float] | None = None
+) -> tuple[TexturedMesh, Frame]:
+    """The mesh in the world, and what has to be said of how it lies there."""
+    asset = str(location.asset)
+    lost = lost_mm(mesh)
+    mesh, moved = place(mesh, (location.up, location.front), origin, asset)
+    if any(moved):
+        text = (
+            f"lies far from its origin: ({', '.join(f'{each:.0f}' for each in moved)}) m are taken off its coordinates"
+        )
+        if lost >= 1:
+            text += f"; they fit float32, whose steps are {lost:.2g} mm there: if they were rounded to it, export anew"
+        say_once(asset, text)
+    if (location.up, location.front) == Y_UP and location.told_up is None and looks_z_up(mesh):
+        own = f'"up": [0, 0, 1], "front": [0, 1, 0] in {location.files[-1].name}' if location.files else "--up z"
+        say_once(asset, f"is taken as Y-up, but looks like a Z-up room on its side; if it is one, say {own}")
+    return mesh, Frame(moved, location.told_up)

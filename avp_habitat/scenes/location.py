@@ -2,7 +2,7 @@
 
 import difflib
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from avp_habitat.errors import AVPError, SceneError, UsageError
@@ -11,12 +11,24 @@ from avp_habitat.scenes.files import SUFFIXES, broken_link
 from avp_habitat.scenes.stage_config import STAGE_CONFIG, Y_UP, Z_UP, Layer, Vector, read_config, read_stage
 
 BUILTIN = "builtin:"
+UPS = ("y", "z")
+"""Axes of a mesh file that can point up."""
 DATASET_CONFIG = ".scene_dataset_config.json"
 HELP = (
     f"a mesh ({' '.join(SUFFIXES)}), a scene folder of Replica, NAME{STAGE_CONFIG}, NAME{DATASET_CONFIG}:ID, or "
     f"{BUILTIN}SEED for a generated room"
 )
 """What a command line says of its option for scenes."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """How a scene's file lies in the world."""
+
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What was taken off the file's coordinates, turned to Y up, in metres; not zero for a scene far from there."""
+    up: str | None = None
+    """The axis of the file that was said to point up; None where nobody said."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +43,8 @@ class SceneLocation:
     """Unit vector in the asset's coordinates that points up."""
     front: Vector = Y_UP[1]
     """Unit vector in the asset's coordinates, at right angles to `up`, that becomes the world's -Z."""
+    told_up: str | None = None
+    """The axis that the user said points up, None for what the file or its config says."""
     dataset: Path | None = None
     """The scene dataset config that the scene belongs to, None for one that was named without it."""
     scene_id: str | None = None
@@ -41,32 +55,41 @@ class SceneLocation:
     """The configs that were read: of the dataset, of the scene, of the stage."""
 
 
-def locate(spec: str) -> SceneLocation:
+def locate(spec: str | Path, *, up: str | None = None) -> SceneLocation:
     """Find a scene without reading its mesh.
 
     Args:
         spec: path of a `.glb`, `.gltf`, `.ply` or `.obj` file (Y up); scene folder of Replica or a mesh in it (Z up);
             `NAME.stage_config.json`; `NAME.scene_dataset_config.json:ID`; or `builtin:SEED` for a generated room.
+        up: axis of a mesh file that points up, `y` or `z`, whatever its folder says; generated rooms are Y-up.
 
     Raises:
-        UsageError: nothing that a scene could be called, or a dataset config without an id.
+        UsageError: nothing that a scene could be called, a dataset config without an id, or `up` beside a config,
+            which has its own.
         SceneError: the scene is missing, or a config is damaged, asks for what is not supported, or refers to what is
             missing or lies outside of the data set's folder (of a stage config alone: the folder above its own).
     """
+    spec = os.fspath(spec)
     if spec.startswith(BUILTIN):
         return SceneLocation(f"{BUILTIN}{_seed(spec)}", None)
     dataset, mark, scene_id = spec.partition(f"{DATASET_CONFIG}:")
-    if mark or spec.endswith(DATASET_CONFIG):
-        return _in_dataset(Path(f"{dataset}{DATASET_CONFIG}" if mark else spec), scene_id)
-    path = Path(spec)
-    if spec.endswith(STAGE_CONFIG):
+    path = Path(f"{dataset}{DATASET_CONFIG}" if mark else spec)
+    if up is not None and path.name.endswith((DATASET_CONFIG, STAGE_CONFIG)):
+        raise UsageError(f"up: {path} says itself which axis of its mesh points up; expected none beside it, got {up}")
+    if path.name.endswith(DATASET_CONFIG):
+        return _in_dataset(path, scene_id)
+    if path.name.endswith(STAGE_CONFIG):
         return _stage(path)
     if path.is_dir():
         path = _mesh_of(path)
     elif path.suffix.lower() not in SUFFIXES:
         raise _unknown(path)
     _expect_file(path, SUFFIXES)
-    return _mesh(path)
+    found = _mesh(path)
+    if up is None:
+        return found
+    axes = {"y": Y_UP, "z": Z_UP}[up]
+    return replace(found, up=axes[0], front=axes[1], told_up=up)
 
 
 def _seed(spec: str) -> int:
@@ -111,7 +134,13 @@ def _in_dataset(path: Path, scene_id: str) -> SceneLocation:
     _expect_file(path, (DATASET_CONFIG,))
     found = SceneDataset(path).scene(scene_id)
     return SceneLocation(
-        found.name, found.stage.asset, *found.stage.axes, path, found.handle, found.objects, (path, *found.files)
+        found.name,
+        found.stage.asset,
+        *found.stage.axes,
+        dataset=path,
+        scene_id=found.handle,
+        objects=found.objects,
+        files=(path, *found.files),
     )
 
 

@@ -14,8 +14,8 @@ class TexturedMesh:
     conversion): scanned scenes carry baked light that is meant to be shown so.
     """
 
-    vertices: NDArray[np.float32]
-    """`(v, 3)` positions in metres."""
+    vertices: NDArray[np.floating]
+    """`(v, 3)` positions in metres, float32; float64 while a file is read, whose coordinates may be large."""
     triangles: NDArray[np.int32]
     """`(t, 3)` vertex indices."""
     uv: NDArray[np.float32]
@@ -37,7 +37,7 @@ class TexturedMesh:
         assert self.texture_index.shape == (triangles,), self.texture_index.shape
 
     @property
-    def bounds(self) -> NDArray[np.float32]:
+    def bounds(self) -> NDArray[np.floating]:
         """`(2, 3)` least and greatest corner in metres."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
@@ -68,3 +68,20 @@ def merge(parts: list[TexturedMesh]) -> TexturedMesh:
         np.concatenate(index),
         textures,
     )
+
+
+def fan_corners(lengths: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Polygons as fans of triangles about their first corners.
+
+    Args:
+        lengths: `(n,)` corners of each polygon, whose corners follow one another.
+
+    Returns:
+        `(t, 3)` places of the triangles' corners in the list of all corners, and `(t,)` the polygons they are of.
+    """
+    lengths = np.asarray(lengths, np.int64)
+    each = np.maximum(lengths - 2, 0)
+    polygons = np.repeat(np.arange(len(lengths)), each)
+    first = (np.cumsum(lengths) - lengths)[polygons]
+    step = np.arange(len(polygons)) - (np.cumsum(each) - each)[polygons]
+    return np.stack([first, first + step + 1, first + step + 2], axis=1), polygons

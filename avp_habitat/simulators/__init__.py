@@ -5,6 +5,7 @@ import os
 import weakref
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from avp_habitat.errors import SimulatorError
 from avp_habitat.simulators.base import Frames, Simulator
@@ -26,13 +27,13 @@ def _raycast(scene: str, choice: SimulatorChoice) -> Simulator:
     from avp_habitat.scenes.loader import load_scene
     from avp_habitat.simulators.raycast import RaycastSimulator
 
-    return RaycastSimulator(load_scene(scene), choice.navmesh)
+    return RaycastSimulator(load_scene(scene, up=choice.up), choice.navmesh)
 
 
 def _habitat(scene: str, choice: SimulatorChoice) -> Simulator:
     from avp_habitat.simulators.habitat import HabitatSimulator
 
-    return HabitatSimulator(scene, gpu=choice.gpu, navmesh=choice.navmesh)
+    return HabitatSimulator(scene, gpu=choice.gpu, navmesh=choice.navmesh, up=choice.up)
 
 
 _Key = tuple[SimulatorChoice, str, float]
@@ -44,26 +45,28 @@ ONE_PER_PROCESS = ("habitat",)
 _shared: weakref.WeakValueDictionary[_Key, Simulator] = weakref.WeakValueDictionary()
 
 
-def make_simulator(name: str, scene: str, *, gpu: int | None = None, navmesh: str | Path | None = None) -> Simulator:
+def make_simulator(name: str, scene: str | Path, **options: Any) -> Simulator:
     """The simulator `name` on a scene.
 
     Args:
         name: `raycast` or `habitat`.
         scene: as `avp_habitat.scenes.location.locate` takes it.
-        gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
-        navmesh: file of the scene's NavMesh (`.navmesh`); computed when omitted.
+        **options: of `SimulatorChoice`: `gpu` (the CUDA device of `habitat`; -1 for none, None for the first one there
+            is), `navmesh` (file of the scene's NavMesh; computed when omitted) and `up` (axis of a mesh file that
+            points up: `y` or `z`).
 
     Raises:
         UsageError: no such simulator, an option that it does not have, or a scene name that cannot be right.
         SceneError: the scene cannot be read, or nobody can stand in it.
         SimulatorError: the simulator is not installed or cannot run here, or this process has another one open.
     """
-    return open_simulator(SimulatorChoice.of(name, gpu=gpu, navmesh=navmesh), scene)
+    return open_simulator(SimulatorChoice.of(name, **options), scene)
 
 
-def open_simulator(choice: SimulatorChoice, scene: str) -> Simulator:
+def open_simulator(choice: SimulatorChoice, scene: str | Path) -> Simulator:
     """The chosen simulator on a scene; arguments and errors as of `make_simulator`."""
     choice.check()
+    scene = os.fspath(scene)
     path = Path(scene)
     # Not where a link leads: what a file refers to lies beside the link.
     key = (choice, os.path.abspath(path), path.stat().st_mtime) if path.is_file() else (choice, scene, 0.0)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.poses import Intrinsics
+from avp_habitat.scenes.location import Frame
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class Simulator(Protocol):
     """What the user called the scene, without folders: a file's name or `builtin:SEED`."""
     scene_digest: str
     """Hexadecimal SHA-256 of the scene's content."""
+    scene_frame: Frame
+    """How the scene's file lies in the world."""
 
     @property
     def area(self) -> NavigableArea:

@@ -5,6 +5,7 @@ from typing import Any, NoReturn
 
 from avp_habitat.errors import SimulatorError
 from avp_habitat.navigation.area import NavigableArea
+from avp_habitat.scenes.location import Frame
 from avp_habitat.simulators.base import Simulator
 
 
@@ -20,13 +21,16 @@ class SimulatorElsewhere:
     """As of the simulator."""
     scene_digest: str
     """As of the simulator."""
+    scene_frame: Frame
+    """As of the simulator."""
     area: NavigableArea
     """As of the simulator."""
 
     @classmethod
     def of(cls, simulator: Simulator) -> "SimulatorElsewhere":
         """What another process may know."""
-        return cls(simulator.name, simulator.version, simulator.scene, simulator.scene_digest, simulator.area)
+        about = (simulator.scene, simulator.scene_digest, simulator.scene_frame)
+        return cls(simulator.name, simulator.version, *about, simulator.area)
 
     def render(self, *_: Any, **__: Any) -> NoReturn:
         """Refused.

@@ -3,8 +3,10 @@
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.scenes.location import UPS
 
 SIMULATOR_NAMES = ("raycast", "habitat")
 _WITH_GPU = "habitat"
@@ -20,30 +22,32 @@ class SimulatorChoice:
     """Habitat's CUDA device; -1 for none, None for the first one that EGL offers."""
     navmesh: Path | None = None
     """File of the scene's NavMesh; computed when None."""
+    up: str | None = None
+    """Axis of a mesh file that points up, `y` or `z`; None for Y, of Replica's files Z."""
 
     @classmethod
-    def of(cls, name: str, *, gpu: int | None = None, navmesh: str | Path | None = None) -> "SimulatorChoice":
+    def of(
+        cls, name: str, *, gpu: int | None = None, navmesh: str | Path | None = None, up: str | None = None
+    ) -> "SimulatorChoice":
         """The same from plain arguments, checked.
 
         Raises:
             UsageError: no such simulator, a number that is no device, or options of another simulator.
         """
-        choice = cls(name, gpu, None if navmesh is None else Path(navmesh))
+        choice = cls(name, gpu, None if navmesh is None else Path(navmesh), up)
         choice.check()
         return choice
 
     @classmethod
-    def unless_open(
-        cls, simulator: object, *, gpu: int | None = None, navmesh: str | Path | None = None
-    ) -> "SimulatorChoice | None":
+    def unless_open(cls, simulator: object, **options: Any) -> "SimulatorChoice | None":
         """The choice by name and options; None for simulators that are open already, which take no options.
 
         Raises:
             UsageError: as `of`, or options beside an open simulator.
         """
         if isinstance(simulator, str):
-            return cls.of(simulator, gpu=gpu, navmesh=navmesh)
-        for option, value in (("gpu", gpu), ("navmesh", navmesh)):
+            return cls.of(simulator, **options)
+        for option, value in options.items():
             if value is not None:
                 raise UsageError(f"{option}: expected none beside a simulator that is open already, got {value}")
         return None
@@ -59,6 +63,8 @@ class SimulatorChoice:
         """
         if self.name not in SIMULATOR_NAMES:
             raise unknown_name("simulator", self.name, SIMULATOR_NAMES)
+        if self.up not in (None, *UPS):
+            raise UsageError(f"{prefix}up: expected {' or '.join(UPS)}, got {self.up!r}")
         if self.gpu is not None and (isinstance(self.gpu, bool) or not isinstance(self.gpu, int) or self.gpu < -1):
             raise UsageError(f"{prefix}gpu: expected a CUDA device from 0, or -1 for none, got {self.gpu!r}")
         if self.gpu is not None and self.name != _WITH_GPU:
@@ -69,7 +75,7 @@ class SimulatorChoice:
 
 
 def add_simulator_options(parser: argparse.ArgumentParser) -> None:
-    """Add `--simulator`, `--gpu` and `--navmesh` to a command; `simulator_choice` reads them."""
+    """Add `--simulator`, `--gpu`, `--navmesh` and `--up` to a command; `simulator_choice` reads them."""
     names = ", ".join(SIMULATOR_NAMES)
     parser.add_argument(
         "--simulator", default="raycast", metavar="NAME", help=f"{names} (Habitat-Sim) (default: raycast)"
@@ -88,6 +94,14 @@ def add_simulator_options(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="the scene's .navmesh (default: computed for the task's agent)",
     )
+    add_up_option(parser)
+
+
+def add_up_option(parser: argparse.ArgumentParser) -> None:
+    """Add `--up` to a command that opens a scene."""
+    parser.add_argument(
+        "--up", choices=UPS, help="axis of a mesh file that points up (default: y, of Replica's files z)"
+    )
 
 
 def simulator_choice(options: argparse.Namespace) -> SimulatorChoice:
@@ -96,6 +110,6 @@ def simulator_choice(options: argparse.Namespace) -> SimulatorChoice:
     Raises:
         UsageError: no such simulator, a number that is no device, or options of another simulator.
     """
-    choice = SimulatorChoice(options.simulator, options.gpu, options.navmesh)
+    choice = SimulatorChoice(options.simulator, options.gpu, options.navmesh, options.up)
     choice.check("--")
     return choice

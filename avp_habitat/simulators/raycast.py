@@ -37,6 +37,7 @@ class RaycastSimulator:
         """
         self.scene = scene.name
         self.scene_digest = scene.digest
+        self.scene_frame = scene.frame
         self.version = f"open3d {metadata.version('open3d')}"
         self._mesh, self._navmesh = scene.mesh, navmesh
         self._rays = _Rays(scene.mesh.vertices, scene.mesh.triangles)

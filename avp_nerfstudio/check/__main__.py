@@ -14,6 +14,8 @@ from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.rollout import Rollout
 from avp_habitat.scenes.loader import Scene, load_scene
 from avp_habitat.scenes.location import HELP as SCENES
+from avp_habitat.scenes.location import UPS, locate
+from avp_habitat.simulators.options import add_up_option
 from avp_nerfstudio.check.outputs import choose_folder, outputs_of_geometry, write_outputs
 from avp_nerfstudio.check.shape import check_format
 from avp_nerfstudio.check.verdict import Verdict
@@ -41,6 +43,8 @@ class Request:
     """Where to write a COLMAP model."""
     pictures: bool = True
     """Whether to hold the poses against the pictures too."""
+    up: str | None = None
+    """Axis of the mesh file that points up; as the rollout says when None."""
 
 
 def check(request: Request) -> list[Verdict]:
@@ -50,11 +54,13 @@ def check(request: Request) -> list[Verdict]:
         UsageError: the mesh is not a scene file.
         AVPError: the scene cannot be read, the results cannot be written, or a package is missing.
     """
-    scene = None if request.mesh is None else load_scene(request.mesh)
+    if request.mesh is not None:
+        locate(request.mesh, up=request.up)
     rollout, verdict = check_format(request.rollout)
     if rollout is None or not rollout.frames:
         write_outputs(request.out, request.rollout, [verdict], {})
         return [verdict]
+    scene = None if request.mesh is None else _scene_of(rollout, request.mesh, request.up)
     from avp_nerfstudio.check.geometry import check_geometry
 
     geometry = _with_bar(check_geometry, rollout, scene)
@@ -63,6 +69,14 @@ def check(request: Request) -> list[Verdict]:
     verdicts = [verdict, *geometry.verdicts, *_pictures(rollout, request)]
     write_outputs(request.out, request.rollout, verdicts, outputs_of_geometry(rollout, geometry, verdicts))
     return verdicts
+
+
+def _scene_of(rollout: Rollout, mesh: str, up: str | None) -> Scene:
+    """The mesh, placed in the world as the rollout says that its scene was."""
+    told = rollout.meta.get("scene")
+    told = told if isinstance(told, dict) else {}
+    own = told.get("up") if told.get("up") in UPS and not mesh.endswith(".json") else None
+    return load_scene(mesh, up=up or own, origin=told.get("origin"))
 
 
 def _with_bar(check_geometry: Any, rollout: Rollout, scene: Scene | None) -> Any:
@@ -109,6 +123,7 @@ def _request(argv: Sequence[str]) -> Request:
     add = parser.add_argument
     add("rollout", type=Path, metavar="ROLLOUT", help="the folder made by `python -m avp_habitat.collect`")
     add("--mesh", metavar="SCENE", help=f"also measure the distance to this scene: {SCENES}")
+    add_up_option(parser)
     add("--export-colmap", type=Path, metavar="DIR", help="also write the rollout as a COLMAP model; must not exist")
     add("--out", type=Path, metavar="DIR", help="where the results go (default: ROLLOUT-check, beside the rollout)")
     add("--no-pictures", action="store_true", help="leave out what is found in the pictures (pycolmap), which is slow")
@@ -119,7 +134,12 @@ def _request(argv: Sequence[str]) -> Request:
     if options.export_colmap is not None and options.export_colmap.exists():
         raise UsageError(f"--export-colmap {options.export_colmap}: exists already, expected a new folder")
     return Request(
-        folder, choose_folder(folder, options.out), options.mesh, options.export_colmap, not options.no_pictures
+        folder,
+        choose_folder(folder, options.out),
+        options.mesh,
+        options.export_colmap,
+        not options.no_pictures,
+        options.up,
     )
 
 

@@ -13,8 +13,8 @@ from avp_habitat.coverage import visible_in_depth
 from avp_habitat.errors import SceneError, SimulatorError
 from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.poses import Intrinsics
-from avp_habitat.scenes.loader import scene_digest
-from avp_habitat.scenes.location import SceneLocation, locate
+from avp_habitat.scenes.loader import identify
+from avp_habitat.scenes.location import Frame, SceneLocation, locate
 from avp_habitat.simulators.base import Frames
 from avp_habitat.simulators.habitat import process
 from avp_habitat.simulators.habitat.graphics import choose_gpu
@@ -34,7 +34,14 @@ class HabitatSimulator:
 
     name = "habitat"
 
-    def __init__(self, scene: str, *, gpu: int | None = None, navmesh: str | Path | None = None) -> None:
+    def __init__(
+        self,
+        scene: str | Path,
+        *,
+        gpu: int | None = None,
+        navmesh: str | Path | None = None,
+        up: str | None = None,
+    ) -> None:
         """Open a scene.
 
         What ends the process inside Habitat-Sim (a second simulator, a missing CUDA device, no EGL, no NavMesh) is
@@ -45,6 +52,7 @@ class HabitatSimulator:
                 `builtin:SEED`; see `avp_habitat.scenes.location.locate`.
             gpu: CUDA device that renders; -1 for none; None for the first one that EGL offers, if any.
             navmesh: a `.navmesh` file; without it the NavMesh is computed for the design's agent.
+            up: axis of a mesh file that points up, `y` or `z`.
 
         Raises:
             UsageError: an option that cannot be right.
@@ -53,9 +61,10 @@ class HabitatSimulator:
         """
         require_installed()
         device = choose_gpu(gpu)
-        location = locate(scene)
-        self.scene, self.scene_digest = location.name, scene_digest(location)
-        self._engine = _open(scene, location, device)
+        location = locate(scene, up=up)
+        self.scene = location.name
+        self.scene_digest, self.scene_frame = identify(location)
+        self._engine = _open(location, self.scene_frame, device)
         self._closing = weakref.finalize(self, _close, self._engine)
         self.version = self._engine.version
         try:
@@ -142,14 +151,14 @@ def _finer(camera: Intrinsics) -> Intrinsics:
     return Intrinsics(*(times * value for value in astuple(camera)))
 
 
-def _open(scene: str, location: SceneLocation, gpu: int) -> "HabitatEngine":
+def _open(location: SceneLocation, frame: Frame, gpu: int) -> "HabitatEngine":
     process.claim(location.name)
     try:
         process.import_before_graphics()
         from avp_habitat.simulators.habitat.engine import HabitatEngine
 
         with tempfile.TemporaryDirectory(prefix="avp-habitat-") as folder:
-            return HabitatEngine(*write_stage(scene, location, Path(folder)), gpu=gpu)
+            return HabitatEngine(*write_stage(location, frame, Path(folder)), gpu=gpu)
     except BaseException:
         process.release()
         raise

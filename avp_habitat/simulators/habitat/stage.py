@@ -4,24 +4,25 @@ import json
 import os
 from pathlib import Path
 
-from avp_habitat.scenes.location import SceneLocation
+from avp_habitat.scenes.location import Frame, SceneLocation
 from avp_habitat.scenes.stage_config import Y_UP
 
 _NAME = "scene"
 _AS_IT_IS = (".glb", ".gltf")
 
 
-def write_stage(scene: str, location: SceneLocation, folder: Path) -> tuple[Path, str]:
+def write_stage(location: SceneLocation, frame: Frame, folder: Path) -> tuple[Path, str]:
     """The dataset config and the id in it by which Habitat-Sim opens a scene.
 
     A bare `.glb` would be read as Z-up, and Habitat-Sim looks beside a bare asset for a NavMesh and semantics that may
     not fit; a stage config of our own says what is meant. Of a `.ply` or `.obj` Habitat-Sim 0.3.4 shows the first mesh
-    only, without vertex colours and not turned by the config's axes, so those are written as `.glb` first. All of it
-    goes to `folder`, never beside the user's files. A scene with objects is opened from its own dataset.
+    only, without vertex colours and not turned by the config's axes, so those are written as `.glb` first, and so is a
+    scene that is far from its file's origin, because a renderer's float32 has no millimetres there. All of it goes to
+    `folder`, never beside the user's files. A scene with objects is opened from its own dataset.
 
     Args:
-        scene: as the user wrote it.
         location: of the scene.
+        frame: how it lies in the world.
         folder: a temporary one.
 
     Returns:
@@ -29,10 +30,11 @@ def write_stage(scene: str, location: SceneLocation, folder: Path) -> tuple[Path
     """
     if location.objects and location.dataset is not None and location.scene_id is not None:
         return Path(os.path.abspath(location.dataset)), location.scene_id
-    if location.asset is not None and location.asset.suffix.lower() in _AS_IT_IS:
+    moved = any(frame.origin)
+    if location.asset is not None and location.asset.suffix.lower() in _AS_IT_IS and not moved:
         asset, (up, front) = os.path.abspath(location.asset), (location.up, location.front)
     else:
-        asset, (up, front) = _as_glb(scene, folder), Y_UP
+        asset, (up, front) = _as_glb(location, folder), Y_UP
     stage = {"render_asset": str(asset), "up": list(up), "front": list(front), "force_flat_shading": True}
     (folder / f"{_NAME}.stage_config.json").write_text(json.dumps(stage), encoding="utf-8")
     dataset = folder / "avp.scene_dataset_config.json"
@@ -40,10 +42,10 @@ def write_stage(scene: str, location: SceneLocation, folder: Path) -> tuple[Path
     return dataset, _NAME
 
 
-def _as_glb(scene: str, folder: Path) -> Path:
+def _as_glb(location: SceneLocation, folder: Path) -> Path:
     from avp_habitat.scenes.export import export_glb
-    from avp_habitat.scenes.loader import load_scene
+    from avp_habitat.scenes.loader import load_located
 
     asset = folder / "room.glb"
-    export_glb(load_scene(scene).mesh, asset)
+    export_glb(load_located(location).mesh, asset)
     return asset

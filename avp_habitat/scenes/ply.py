@@ -1,0 +1,291 @@
+"""Reads PLY files, text or binary, into one TexturedMesh.
+
+Layout: header of elements (`vertex`, `face`, …) with typed properties, then their rows; a property that is a list has
+a number of values of its own in each row (G. Turk, The PLY Polygon File Format).
+"""
+
+import re
+import struct
+import warnings
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.errors import SceneError
+from avp_habitat.scenes.files import SceneFiles, decode_picture
+from avp_habitat.scenes.mesh import TexturedMesh, fan_corners
+from avp_habitat.scenes.notices import say_once
+
+_CODES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
+_CODES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
+_CODES |= {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
+_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+_CORNERS = ("vertex_indices", "vertex_index")
+_COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+_COORDINATES = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
+_COLOUR_LIKE = re.compile(r"red|rgb|colou?r|f_dc|intensity|material_ind", re.IGNORECASE)
+"""Names of properties that may mean a colour."""
+_MALFORMED = (ArithmeticError, LookupError, TypeError, ValueError, struct.error)
+
+
+@dataclass(frozen=True)
+class _Property:
+    name: str
+    values: np.dtype
+    """As they lie in the body; every number of a text is a float64 there."""
+    count: np.dtype | None
+    """Of a list's number of values; None for a single value."""
+    integer: bool
+    """Whether the header says that the values are whole numbers."""
+
+
+@dataclass(frozen=True)
+class _Element:
+    name: str
+    rows: int
+    properties: list[_Property] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Column:
+    """The values of a property, row after row."""
+
+    values: NDArray
+    lengths: NDArray[np.int64]
+    """`(rows,)` how many values each row has."""
+    integer: bool
+
+
+_Columns = dict[str, _Column]
+
+
+def read_ply(files: SceneFiles) -> TexturedMesh:
+    """The polygons of a `.ply` file as fans of triangles, float64 positions in the file's axes.
+
+    Colours are those of vertices, else those of faces; a texture is named by a comment `TextureFile NAME`.
+
+    Args:
+        files: the file and its folder.
+
+    Raises:
+        SceneError: the file is damaged, holds no face, or refers to a file that is missing or outside its folder.
+    """
+    try:
+        tables, pictures = _tables(files.main)
+        return _mesh(files, tables, pictures)
+    except _MALFORMED as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise SceneError(f"{files.path}: expected a valid .ply file, but it is damaged: {reason}") from error
+
+
+def _tables(content: bytes) -> tuple[dict[str, _Columns], list[str]]:
+    """The columns of each element, and the names of the textures.
+
+    Raises:
+        ValueError: the header or the body cannot be right.
+    """
+    end = re.search(rb"\bend_header[ \t]*(\r\n|\n|\r|$)", content)
+    if not content.startswith(b"ply"):
+        raise ValueError("it does not begin with the line ply")
+    if end is None:
+        raise ValueError("truncated: expected a header that ends with end_header")
+    lines = content[: end.start()].decode("utf-8", "replace").splitlines()
+    order, elements, pictures = _header([line.split() for line in lines[1:] if line.strip()], lines)
+    body = content[end.end() :]
+    if order == "=":
+        body = _numbers(body)
+    at, tables = 0, {}
+    for element in elements:
+        tables[element.name], at = _read(element, body, at)
+    return tables, pictures
+
+
+def _header(words: list[list[str]], lines: list[str]) -> tuple[str, list[_Element], list[str]]:
+    order, elements = "", []
+    for line in words:
+        if line[0] == "format":
+            order = _ORDERS[line[1]]
+        elif line[0] == "element":
+            elements.append(_Element(line[1], int(line[2])))
+            if elements[-1].rows < 0:
+                raise ValueError(f"element {line[1]} has {line[2]} rows")
+        elif line[0] == "property":
+            elements[-1].properties.append(_property(line[1:], order))
+    pictures = [found[1].strip() for line in lines if (found := re.match(r"comment\s+TextureFile\s+(.+)", line))]
+    if not order:
+        raise ValueError("the header names no format")
+    return order, elements, pictures
+
+
+def _property(words: list[str], order: str) -> _Property:
+    codes = [_CODES.get(word) for word in (words[1:3] if words[0] == "list" else words[:1])]
+    if None in codes or not order:
+        raise ValueError(f"expected a property of a known type, got {' '.join(words)}")
+    stored = [np.dtype("=f8" if order == "=" else f"{order}{code}") for code in codes]
+    return _Property(words[-1], stored[-1], stored[0] if len(stored) == 2 else None, str(codes[-1])[0] in "iu")
+
+
+def _numbers(text: bytes) -> bytes:
+    """The numbers of a text as float64."""
+    with warnings.catch_warnings():
+        # What is no number ends the reading with a warning only.
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            return np.fromstring(text.decode("ascii"), np.float64, sep=" ").tobytes()
+        except (DeprecationWarning, ValueError):
+            raise ValueError("expected numbers after the header, got something else") from None
+
+
+def _read(element: _Element, body: bytes, start: int) -> tuple[_Columns, int]:
+    """The columns of an element whose rows start at a byte of the body, and where they end."""
+    least = sum((each.count or each.values).itemsize for each in element.properties)
+    if element.rows * least > len(body) - start:
+        raise ValueError(
+            f"truncated: the header announces {element.rows} rows of {element.name}, for which {len(body) - start} "
+            f"bytes are left where at least {element.rows * least} are needed"
+        )
+    if not element.rows or not element.properties:
+        return {}, start
+    places, end = _walk(element, body, start, 1)
+    row = end - start
+    if start + row * element.rows <= len(body) and _all_alike(element, body, places[0], row):
+        shapes = [(element.rows, int(length)) for _, length in places[0]]
+        columns = [
+            np.ndarray(shape, each.values, body, int(at), (row, each.values.itemsize)).reshape(-1)
+            for each, shape, (at, _) in zip(element.properties, shapes, places[0], strict=True)
+        ]
+        lengths = [np.full(rows, length) for rows, length in shapes]
+        end = start + row * element.rows
+    else:
+        places, end = _walk(element, body, start, element.rows)
+        lengths = list(places[:, :, 1].T)
+        columns = [
+            np.frombuffer(b"".join([body[at : at + n * each.values.itemsize] for at, n in place]), each.values)
+            for each, place in zip(element.properties, places.transpose(1, 0, 2).tolist(), strict=True)
+        ]
+    return {
+        each.name: _Column(values, length, each.integer)
+        for each, values, length in zip(element.properties, columns, lengths, strict=True)
+    }, end
+
+
+def _walk(element: _Element, body: bytes, at: int, rows: int) -> tuple[NDArray[np.int64], int]:
+    """`(rows, properties, 2)` first byte and number of values of each property, and where the last row ends."""
+    places = []
+    counts = [None if each.count is None else struct.Struct(_struct_code(each.count)) for each in element.properties]
+    sizes = [each.values.itemsize for each in element.properties]
+    for _ in range(rows):
+        for count, size in zip(counts, sizes, strict=True):
+            length = 1
+            if count is not None:
+                length, at = int(count.unpack_from(body, at)[0]), at + count.size
+            places.append((at, length))
+            at += length * size
+            if length < 0 or at > len(body):
+                raise ValueError(f"truncated: the rows of {element.name} do not end where the file does")
+    return np.array(places, np.int64).reshape(rows, len(sizes), 2), at
+
+
+def _struct_code(stored: np.dtype) -> str:
+    return (">" if stored.byteorder == ">" else "<") + stored.char
+
+
+def _all_alike(element: _Element, body: bytes, places: NDArray[np.int64], row: int) -> bool:
+    """Whether the lists of all rows are as long as those of the first one."""
+    for each, (at, length) in zip(element.properties, places.tolist(), strict=True):
+        if each.count is not None:
+            counts = np.ndarray((element.rows,), each.count, body, at - each.count.itemsize, (row,))
+            if (counts != length).any():
+                return False
+    return True
+
+
+def _mesh(files: SceneFiles, tables: dict[str, _Columns], pictures: list[str]) -> TexturedMesh:
+    vertex, face = tables.get("vertex", {}), tables.get("face", {})
+    positions = _together(vertex, ("x", "y", "z"))
+    listed = next((face[name] for name in _CORNERS if name in face), None)
+    if positions is None or listed is None:
+        kinds = ", ".join(f"{name} ({', '.join(columns)})" for name, columns in tables.items() if columns)
+        raise SceneError(
+            f"{files.path}: expected a mesh with triangles, found none, but {kinds or 'nothing'}; is it a point cloud?"
+        )
+    corners, faces = fan_corners(listed.lengths)
+    triangles = listed.values.astype(np.int64)[corners]
+    if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(positions):
+        raise SceneError(
+            f"{files.path}: a face names vertices {triangles.min()} to {triangles.max()} of {len(positions)}"
+        )
+    colours, of_faces = _colours(vertex), _colours(face)
+    wedges = _wedges(face, listed, corners)
+    if (colours is None and of_faces is not None) or wedges is not None:
+        # Colours and texture coordinates of faces: each triangle gets corners of its own.
+        colours = colours[triangles].reshape(-1, 3) if colours is not None else None
+        if colours is None and of_faces is not None:
+            colours = np.repeat(of_faces[faces], 3, axis=0)
+        uv = wedges
+        positions = positions[triangles].reshape(-1, 3)
+        triangles = np.arange(len(positions)).reshape(-1, 3)
+    else:
+        uv = next((found for names in _COORDINATES if (found := _together(vertex, names)) is not None), None)
+    textures = [decode_picture(files.read(name), f"{files.path}: {name}") for name in pictures]
+    if colours is None and not (textures and uv is not None):
+        _say_what_is_lost(files, vertex, face, pictures)
+    return TexturedMesh(
+        positions,
+        triangles.astype(np.int32),
+        _downwards(uv, len(positions)),
+        np.ones((len(positions), 3), np.float32) if colours is None else colours,
+        _texture_index(face, faces, len(textures) if uv is not None else 0),
+        textures if uv is not None else [],
+    )
+
+
+def _together(columns: _Columns, names: tuple[str, ...]) -> NDArray[np.float64] | None:
+    """`(rows, len(names))` of single values; None where one of them is missing."""
+    if any(name not in columns or (columns[name].lengths != 1).any() for name in names):
+        return None
+    return np.stack([columns[name].values.astype(np.float64) for name in names], axis=1)
+
+
+def _colours(columns: _Columns) -> NDArray[np.float32] | None:
+    """`(rows, 3)` in [0, 1]: whole numbers are shares of 255, or of 65535 if one is greater; floats of 1, or of 255."""
+    for names in _COLOURS:
+        stored = _together(columns, names)
+        if stored is not None and len(stored):
+            integer, highest = columns[names[0]].integer, stored.max()
+            stored = np.where((stored < 0) & integer, stored + 256, stored)  # Bytes that were declared with a sign.
+            whole = (65535 if highest > 255 else 255) if integer else (255 if highest > 2 else 1)
+            return np.clip(stored / whole, 0, 1).astype(np.float32)
+    return None
+
+
+def _wedges(face: _Columns, listed: _Column, corners: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """`(3 t, 2)` texture coordinates of the triangles' corners; None where not every corner has some."""
+    found = face.get("texcoord")
+    if found is None or (found.lengths != 2 * listed.lengths).any():
+        return None
+    return found.values.astype(np.float64).reshape(-1, 2)[corners].reshape(-1, 2)
+
+
+def _downwards(uv: NDArray[np.float64] | None, count: int) -> NDArray[np.float32]:
+    if uv is None:
+        return np.zeros((count, 2), np.float32)
+    return np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype(np.float32)
+
+
+def _texture_index(face: _Columns, faces: NDArray[np.int64], textures: int) -> NDArray[np.int32]:
+    """`(t,)` the texture that a face names, which is the first one where it names none."""
+    if not textures or "texnumber" not in face:
+        return np.full(len(faces), 0 if textures else -1, np.int32)
+    named = face["texnumber"].values.astype(np.int64)[faces]
+    return np.where((named >= 0) & (named < textures), named, -1).astype(np.int32)
+
+
+def _say_what_is_lost(files: SceneFiles, vertex: _Columns, face: _Columns, pictures: list[str]) -> None:
+    names = [name for name in (*vertex, *face) if _COLOUR_LIKE.search(name)]
+    known = "colours are read from " + ", ".join("/".join(each) for each in _COLOURS)
+    if names:
+        say_once(str(files.path), f"is shown white: its {', '.join(names)} are not followed ({known})")
+    elif pictures:
+        say_once(str(files.path), f"is shown white: it names {', '.join(pictures)}, but has no texture coordinates")
