@@ -26,7 +26,8 @@ _AHEAD = 8
 class RolloutWriter:
     """A context in which frames are written to a temporary folder, renamed to its final name by `publish`.
 
-    Views are encoded in threads while the next are rendered; a disk that fails is reported by one of the next calls.
+    Views are encoded in threads while the next are rendered: their arrays must not change once they were added, and a
+    disk that fails is reported by one of the next calls, by `publish` at the latest.
     Leaving the context without `publish` (an error, Ctrl-C) removes the temporary folder.
     """
 

@@ -211,6 +211,15 @@ def test_a_texture_pinched_to_a_point_is_still_a_colour():
         assert (rgb == 77).all()
 
 
+@pytest.mark.parametrize("place", [np.nan, np.inf, -np.inf])
+def test_a_texture_at_no_place_at_all_is_not_read_beside_the_picture(place):
+    mesh = wall(np.full((8, 8, 3), 77, np.uint8))
+    uv = np.full((4, 2), place, np.float32)
+    nowhere = TexturedMesh(mesh.vertices, mesh.triangles, uv, mesh.colours, mesh.texture_index, mesh.textures)
+    frames = simulator(nowhere).render(facing([0, 0.5, 0]), Intrinsics(4, 4, 20.0, 20.0, 2.0, 2.0), rgb=True)
+    np.testing.assert_allclose(frames.depth, 1.0, atol=1e-5)
+
+
 def brute_force_nearest(origins, directions, mesh):
     """Smallest t > 0 at which each ray meets any triangle, by Cramer's rule in float64."""
     a, b, c = (mesh.vertices[mesh.triangles[:, i]].astype(np.float64) for i in range(3))

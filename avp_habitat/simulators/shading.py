@@ -1,5 +1,6 @@
 """Colours of ray hits on a textured mesh, filtered over each pixel's footprint."""
 
+import itertools
 import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -73,8 +74,9 @@ def pack_surface(mesh: TexturedMesh) -> Surface:
 
 
 def _packed(picture: NDArray[np.uint8]) -> NDArray[np.uint32]:
-    red, green, blue = picture.reshape(-1, 3).astype(np.uint32).T
-    return red | green << 8 | blue << 16
+    packed = np.zeros((picture.shape[0] * picture.shape[1], 4), np.uint8)
+    packed[:, :3] = picture.reshape(-1, 3)
+    return packed.view("<u4")[:, 0]
 
 
 def _pyramid(texture: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
@@ -105,10 +107,14 @@ def shade(surface: Surface, hits: Hits) -> NDArray[np.uint8]:
     """
     cameras, pixels = hits.distance.shape
     out = np.zeros((cameras, pixels, 3), np.uint8)
-    tasks = [(camera, start) for camera in range(cameras) for start in range(0, pixels, _PIXELS_PER_TASK)]
+
+    def shade_part(task: tuple[int, int]) -> None:
+        camera, start = task
+        _shade(surface, hits, camera, start, min(start + _PIXELS_PER_TASK, pixels), out)
+
     # Plain threads: numba's own would bring OpenMP or TBB along, which do not survive a fork of the process.
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(lambda task: _shade(surface, hits, *task, min(task[1] + _PIXELS_PER_TASK, pixels), out), tasks))
+        list(pool.map(shade_part, itertools.product(range(cameras), range(0, pixels, _PIXELS_PER_TASK))))
     return out
 
 
