@@ -133,7 +133,7 @@ def _placed(
         far = f"{max(map(abs, moved)):.0f} m"
         if lost >= _MOST_LOST_MM:
             raise SceneError(
-                f"{asset}: has coordinates of {far}, in float32, which has steps of {lost:.0f} mm there: "
+                f"{asset}: has coordinates of {far} in float32, which has steps of {lost:.0f} mm there: "
                 "expected a mesh that was exported near its origin"
             )
         text = f"lies {far} from its origin: ({', '.join(f'{each:.0f}' for each in moved)}) m are taken off"
