@@ -14,6 +14,7 @@ from avp_habitat.scenes.placing import check_numbers, looks_z_up, lost_mm, place
 from avp_habitat.scenes.stage_config import Y_UP
 
 _GLTF = (".glb", ".gltf")
+_MOST_LOST_MM = 100
 
 
 @dataclass(frozen=True)
@@ -126,15 +127,17 @@ def _placed(
 ) -> tuple[TexturedMesh, Frame]:
     """The mesh in the world, and what has to be said of how it lies there."""
     asset = str(location.asset)
-    lost = lost_mm(mesh)
+    lost = 0.0 if asset.lower().endswith(".obj") else lost_mm(mesh)
     mesh, moved = place(mesh, (location.up, location.front), origin, asset)
     if any(moved):
-        text = (
-            f"lies far from its origin: ({', '.join(f'{each:.0f}' for each in moved)}) m are taken off its coordinates"
-        )
-        if lost >= 1:
-            text += f"; they fit float32, whose steps are {lost:.2g} mm there: if they were rounded to it, export anew"
-        say_once(asset, text)
+        far = f"{max(map(abs, moved)):.0f} m"
+        if lost >= _MOST_LOST_MM:
+            raise SceneError(
+                f"{asset}: has coordinates of {far} in float32, which has steps of {lost:.0f} mm there: "
+                "expected a mesh that was exported near its origin"
+            )
+        text = f"lies {far} from its origin: ({', '.join(f'{each:.0f}' for each in moved)}) m are taken off"
+        say_once(asset, text + (f"; as float32, its coordinates are rounded to {lost:.0f} mm" if lost >= 1 else ""))
     if (location.up, location.front) == Y_UP and location.told_up is None and looks_z_up(mesh):
         own = f'"up": [0, 0, 1], "front": [0, 1, 0] in {location.files[-1].name}' if location.files else "--up z"
         say_once(asset, f"is taken as Y-up, but looks like a Z-up room on its side; if it is one, say {own}")

@@ -56,8 +56,9 @@ class MaterialLibrary:
             self._newest.lost.append(f"Kd {words[0]}")
             return
         numbers = [float(word) for word in words[:3]]
-        # One number is of all three.
-        self._newest.diffuse = numbers if len(numbers) == 3 else [numbers[0]] * 3
+        if len(numbers) not in (1, 3):
+            raise ValueError(f"expected one number or three, got {len(numbers)}")
+        self._newest.diffuse = numbers * (3 // len(numbers))
 
 
 def _take_texture(material: Material, rest: str) -> None:

@@ -11,6 +11,9 @@ from avp_habitat.scenes.mesh import TexturedMesh, fan_corners
 from avp_habitat.scenes.mtl import Material, MaterialLibrary
 from avp_habitat.scenes.notices import say_once
 
+_MOST = 2**31 - 1
+"""What an index of 32 bits can hold."""
+
 
 def read_obj(files: SceneFiles) -> TexturedMesh:
     """The polygons of an `.obj` file as fans of triangles, float64 positions in the file's axes.
@@ -180,6 +183,8 @@ def _index(text: str, count: int) -> int:
     """From 0; negative numbers count back from the newest one of `count` so far."""
     number = int(text)
     index = number - 1 if number > 0 else count + number
+    if number > _MOST:
+        raise ValueError(f"a face names {number}; expected {_MOST} at most")
     if number == 0 or index < 0:
         raise ValueError(f"{number} is none of the {count} before it; expected 1, 2, … or -1, -2, …")
     return index

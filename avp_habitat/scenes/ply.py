@@ -178,7 +178,7 @@ def _walk(element: _Element, body: bytes, at: int, rows: int) -> tuple[NDArray[n
     for _ in range(rows):
         for count, size in zip(counts, sizes, strict=True):
             length = 1
-            if count is not None:
+            if count is not None and at + count.size <= len(body):
                 length, at = int(count.unpack_from(body, at)[0]), at + count.size
             places.append((at, length))
             at += length * size
