@@ -50,6 +50,8 @@ class Geometry:
     """The rollout's own."""
     bad: NDArray[np.bool_]
     """`(n,)` frames that disagree."""
+    proved: NDArray[np.bool_]
+    """`(n,)` frames that agree, and whose surfaces fix all six directions in which their poses could be off."""
     diagnosis: Diagnosis | None
     """What explains the disagreement, where that is known."""
 
@@ -87,6 +89,7 @@ def check_geometry(
     bad = bad_frames(agreement, given.kept)
     passed = agrees(agreement, given.kept)
     corrections = _corrections(comparison, given, agreement, bad)
+    proved = _proved(agreement, given, corrections) & ~bad
     diagnosis = None if passed else _diagnose(comparison, given, rollout, bad, corrections)
     verdicts = [
         _agreement_verdict(comparison, given, agreement, bad, passed),
@@ -97,7 +100,7 @@ def check_geometry(
         measured = mesh_distance(maps, given, scene, named=named.get("sha256") if isinstance(named, dict) else None)
         verdicts.append(measured.verdict)
         bad = bad | measured.bad
-    return Geometry([_with_cause(v, diagnosis, given, bad) for v in verdicts], maps, given, bad, diagnosis)
+    return Geometry([_with_cause(v, diagnosis, given, bad) for v in verdicts], maps, given, bad, proved, diagnosis)
 
 
 def _diagnose(
@@ -116,6 +119,18 @@ def _diagnose(
     if found is None and 0 < len(numbers) <= max(_FEW, 0.25 * len(bad)):
         found = frame_mistake(comparison, given, numbers, corrections=corrections, name=partial(name_of, given))
     return found
+
+
+def _proved(agreement: Agreement, given: Cameras, corrections: dict[int, Correction | None]) -> NDArray[np.bool_]:
+    share, compared = agreement.per_frame(given.kept)
+    fixed = np.zeros(len(given.poses), bool)
+    for frame, correction in corrections.items():
+        fixed[frame] = correction is not None and correction.fixed_directions == 6 and _small(correction)
+    return fixed & (compared >= LEAST_COMPARED) & (share >= AGREEING_SHARE_OF_FRAME)
+
+
+def _small(correction: Correction) -> bool:
+    return correction.distance_m <= CORRECTION_M and correction.rotation_deg <= CORRECTION_DEG
 
 
 def _corrections(
@@ -206,7 +221,7 @@ def _correction_verdict(given: Cameras, corrections: dict[int, Correction | None
         return Verdict("ICP correction", True, "no frame could be registered to others")
     worst = max(found, key=lambda frame: max(found[frame].distance_m / CORRECTION_M, found[frame].rotation_deg))
     shift, turn = found[worst].distance_m, found[worst].rotation_deg
-    wrong = [f for f, c in found.items() if c.distance_m > CORRECTION_M or c.rotation_deg > CORRECTION_DEG]
+    wrong = [f for f, c in found.items() if not _small(c)]
     text = (
         f"ICP would improve {len(wrong)} of {len(found)} frames by more than {1000 * CORRECTION_M:.0f} mm or "
         f"{CORRECTION_DEG} degrees (limit 0)"
