@@ -70,29 +70,37 @@ def name_of(cameras: Cameras, frame: int) -> str:
 
 
 def check_geometry(
-    rollout: Rollout, scene: Scene | None = None, *, progress: Callable[[], object] = lambda: None
+    rollout: Rollout,
+    scene: Scene | None = None,
+    *,
+    maps: DepthMaps | None = None,
+    explain: bool = True,
+    progress: Callable[[], object] = lambda: None,
 ) -> Geometry:
     """Compare all depth pictures of a rollout with each other and, if given, with the scene.
 
     Args:
         rollout: at least one frame.
         scene: the mesh it was captured in.
+        maps: its depth, where it was read already.
+        explain: also look for the mistake behind a disagreement, and for mistakes that would not show.
         progress: called after each picture that was read.
 
     Raises:
         RolloutError: a depth picture cannot be decoded.
     """
     given = cameras_of(rollout)
-    maps = load_depth_maps(rollout.frames + rollout.heldout, rollout.intrinsics, progress=progress)
+    maps = maps or load_depth_maps(rollout.frames + rollout.heldout, rollout.intrinsics, progress=progress)
     comparison = Comparison(maps)
     agreement = comparison.full(given)
     bad = bad_frames(agreement, given.kept)
     passed = agrees(agreement, given.kept)
     corrections = _corrections(comparison, given, agreement, bad)
     proved = _proved(agreement, given, corrections) & ~bad
-    diagnosis = None if passed else _diagnose(comparison, given, rollout, bad, corrections)
+    diagnosis = None if passed or not explain else _diagnose(comparison, given, rollout, bad, corrections)
+    hidden = _hidden_mistakes(comparison, given) if passed and explain else []
     verdicts = [
-        _agreement_verdict(comparison, given, agreement, bad, passed),
+        _agreement_verdict(given, agreement, bad, passed, hidden),
         _correction_verdict(given, corrections),
     ]
     if scene is not None:
@@ -164,7 +172,7 @@ def _correction(
 
 
 def _agreement_verdict(
-    comparison: Comparison, given: Cameras, agreement: Agreement, bad: NDArray[np.bool_], passed: bool
+    given: Cameras, agreement: Agreement, bad: NDArray[np.bool_], passed: bool, hidden: list[str]
 ) -> Verdict:
     share, compared = agreement.per_frame(given.kept)
     judged = compared >= LEAST_COMPARED
@@ -186,7 +194,6 @@ def _agreement_verdict(
         f"(limit {100 * AGREEING_SHARE} %); worst is {name_of(given, worst)} with {100 * share[worst]:.1f} % "
         f"(limit {100 * AGREEING_SHARE_OF_FRAME:.0f} %)"
     )
-    hidden = _hidden_mistakes(comparison, given) if passed else []
     if hidden:
         text += f"; these views cannot show {', '.join(hidden)}"
     return Verdict("depth agreement", passed, text, figures)

@@ -24,7 +24,8 @@ from avp_nerfstudio.check.verdict import Verdict
 Float = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-# In correct rollouts MISFIT_MEASURED of a frame's matches do not fit (median over the frames): false ones.
+# Percent of a frame's matches that do not fit, median over the frames. In 24 correct rollouts of all policies and
+# sizes 2 to 17 % did not: false ones, and features of blurred walls. Wrong conventions leave 60 to 100 %.
 MISFIT_LIMIT = 0.4
 # Rotations 0.00 to 0.08 deg off (median of the pairs; 0.21 at 320x240), directions 0.15 to 1.6 deg, 5.9 deg in that
 # random walk. Single pairs can be far off where a wall fills both pictures, so a frame's own median only shows gross
