@@ -16,7 +16,7 @@ from avp_nerfstudio.check.pictures_rays import Stacked, pair_medians, ray_errors
 Float = NDArray[np.floating]
 
 FOCAL_RANGE = (0.75, 1.33)
-# In correct rollouts no other focal length was better by the gain below; one that was 1 % off was found 0.8 to 1.0 % off.
+# In correct rollouts no other focal length was better by the gain below; one 1 % off was found 0.8 to 1.0 % off.
 FOCAL_TOLERANCE = 0.005
 # A focal length 1 % off raised the mean error of the pairs, on a walk of the white room, from 0.9 to 1.4 px.
 FOCAL_GAIN_PX = 0.03

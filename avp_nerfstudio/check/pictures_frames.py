@@ -17,8 +17,8 @@ Float = NDArray[np.floating]
 # Errors of true matches are 0.1 to 0.2 px in the middle at every size of picture; 0.5 degrees are 0.7 px at 160x120.
 FIT_PX = 0.7
 # A pose that is right gains too when it is freed: six numbers adapt to the noise and to some false matches. The frames
-# that fitted least in 24 correct rollouts gained at most 0.13 with ten pairs or more and 0.20 with four; a pose that was
-# 5 cm or 0.5 degrees off gained 0.3 to 0.9, unless all its pairs were turns on the spot, which hide where it stands.
+# that fitted least in 24 correct rollouts gained at most 0.13 with ten pairs or more and 0.20 with four; a pose that
+# was 5 cm or 0.5 degrees off gained 0.3 to 0.9, unless all its pairs were turns on the spot, which hide where it is.
 USUAL_GAIN = 0.1
 SPREAD_OF_PAIRS = 0.13
 # Chance that a correct rollout has a frame beyond the limit, were the gains of pairs independent and normal.
@@ -47,7 +47,7 @@ class FreedFit:
         return self.freed - self.given
 
 
-def gain_limit(pairs: float, frames: int) -> float:
+def gain_limit(pairs: int, frames: int) -> float:
     """Greatest gain that chance explains: it grows as the evidence shrinks, and with the number of frames tested.
 
     Args:
@@ -60,12 +60,16 @@ def gain_limit(pairs: float, frames: int) -> float:
 def frame_shares(stacked: Stacked, poses: Float, intrinsics: Intrinsics) -> Float:
     """`(n,)` share of each picture's matches that fit the poses within `FIT_PX`; NaN for a picture without any."""
     fits = ray_errors(stacked, poses, intrinsics) < FIT_PX
-    sides = stacked.first[stacked.pair], stacked.second[stacked.pair]
-    fitting, all_of_it = (
-        sum(np.bincount(side, weights, minlength=len(poses)) for side in sides) for weights in (fits, None)
-    )
+    sides = np.concatenate([stacked.first[stacked.pair], stacked.second[stacked.pair]])
     with np.errstate(invalid="ignore"):
-        return fitting / all_of_it
+        return np.bincount(sides, np.tile(fits, 2), len(poses)) / np.bincount(sides, minlength=len(poses))
+
+
+def pair_shares(stacked: Stacked, poses: Float, intrinsics: Intrinsics) -> dict[tuple[int, int], float]:
+    """Share of the matches of each pair of pictures, earlier first, that fit the poses within `FIT_PX`."""
+    fits = ray_errors(stacked, poses, intrinsics) < FIT_PX
+    shares = np.bincount(stacked.pair, fits, len(stacked.first)) / np.diff(stacked.start)
+    return dict(zip(zip(stacked.first.tolist(), stacked.second.tolist(), strict=True), shares.tolist(), strict=True))
 
 
 def freed_fit(stacked: Stacked, poses: Float, intrinsics: Intrinsics, picture: int) -> FreedFit:
@@ -124,7 +128,7 @@ def frames_off(
     tested = int((pairs > 0).sum())
     found = {}
     for picture in np.flatnonzero(pairs):
-        limit = max(gain_limit(pairs[picture], tested), PROVED_GAIN * proved[picture])
+        limit = max(gain_limit(int(pairs[picture]), tested), PROVED_GAIN * proved[picture])
         # No gain is greater than what does not fit yet.
         if 1 - shares[picture] > limit:
             fit = freed_fit(stacked, poses, intrinsics, int(picture))
