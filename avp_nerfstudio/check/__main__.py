@@ -66,7 +66,7 @@ def check(request: Request) -> list[Verdict]:
     geometry = _with_bar(check_geometry, rollout, scene)
     if not verdict.passed and geometry.diagnosis is not None:
         verdict = replace(verdict, cause=geometry.diagnosis.cause)
-    verdicts = [verdict, *geometry.verdicts, *_pictures(rollout, request)]
+    verdicts = [verdict, *geometry.verdicts, *_pictures(rollout, request, geometry.proved)]
     write_outputs(request.out, request.rollout, verdicts, outputs_of_geometry(rollout, geometry, verdicts))
     return verdicts
 
@@ -85,8 +85,11 @@ def _with_bar(check_geometry: Any, rollout: Rollout, scene: Scene | None) -> Any
         return check_geometry(rollout, scene, progress=bar.update)
 
 
-def _pictures(rollout: Rollout, request: Request) -> list[Verdict]:
-    """The verdicts of the pictures; the matches that they need serve the COLMAP model too."""
+def _pictures(rollout: Rollout, request: Request, proved: Any) -> list[Verdict]:
+    """The verdicts of the pictures; the matches that they need serve the COLMAP model too.
+
+    `proved` is an `(n,)` mask of the frames, perhaps with more after them, whose poses the depth proves right.
+    """
     if not request.pictures and request.export_colmap is None:
         return []
     try:
@@ -98,7 +101,7 @@ def _pictures(rollout: Rollout, request: Request) -> list[Verdict]:
             f"checking the pictures needs {error.name}: pip install {error.name}, or leave it out with --no-pictures"
         ) from None
     matches = match_pictures(rollout)
-    verdicts = check_pictures(rollout, matches=matches) if request.pictures else []
+    verdicts = check_pictures(rollout, matches=matches, proved=proved) if request.pictures else []
     if request.export_colmap is not None:
         print(f"COLMAP model: {export_colmap(rollout, request.export_colmap, matches=matches)}")
     return verdicts
