@@ -12,11 +12,13 @@ import pygltflib
 from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
-from avp_habitat.scenes.files import SceneFiles, decode_picture
+from avp_habitat.scenes.files import SceneFiles, check_memory, decode_picture
 from avp_habitat.scenes.gltf_buffers import Buffers
 from avp_habitat.scenes.mesh import TexturedMesh, merge
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_VERTEX_BYTES, _CORNER_BYTES = 160, 30
+"""What reading takes at most for each vertex and each triangle's corner, copies included."""
 # What walking through a document raises where a field is missing, of another type or out of range.
 _MALFORMED = (
     ArithmeticError,
@@ -89,12 +91,15 @@ class _Reader:
 
     def mesh(self) -> TexturedMesh:
         """All triangles of the default scene, placed in the world."""
-        parts = [
-            part
+        placed = [
+            (primitive, to_world)
             for mesh, to_world in self._placed_meshes()
             for primitive in self._document.meshes[mesh].primitives
-            if (part := self._primitive(primitive, to_world)) is not None
+            if primitive.attributes.POSITION is not None
         ]
+        # A small file can name the same vertices again and again.
+        check_memory(f"{self._path}: its mesh", sum(self._bytes_of(primitive) for primitive, _ in placed))
+        parts = [part for each in placed if (part := self._primitive(*each)) is not None]
         if not parts:
             raise SceneError(f"{self._path}: expected a mesh with triangles, found none in the default scene")
         return merge(parts)
@@ -121,10 +126,15 @@ class _Reader:
                 yield node.mesh, to_world
             waiting += [(child, to_world) for child in reversed(node.children or [])]
 
+    def _bytes_of(self, primitive: pygltflib.Primitive) -> int:
+        vertices = self._document.accessors[primitive.attributes.POSITION].count
+        corners = vertices if primitive.indices is None else self._document.accessors[primitive.indices].count
+        return _VERTEX_BYTES * vertices + _CORNER_BYTES * corners
+
     def _primitive(self, primitive: pygltflib.Primitive, to_world: NDArray) -> TexturedMesh | None:
         mode = _TRIANGLES if primitive.mode is None else primitive.mode
         attributes = primitive.attributes
-        if mode not in (_TRIANGLES, _STRIP, _FAN) or attributes.POSITION is None:
+        if mode not in (_TRIANGLES, _STRIP, _FAN):
             return None
         if "KHR_draco_mesh_compression" in (primitive.extensions or {}) and not self._has_data(attributes.POSITION):
             raise SceneError(f"{self._path}: uses KHR_draco_mesh_compression, which is not supported")

@@ -86,7 +86,7 @@ class Buffers:
     def _dense(self, index: int, dtype: np.dtype, shape: tuple[int, int]) -> NDArray:
         accessor = self._document.accessors[index]
         if accessor.bufferView is None:
-            return np.zeros(shape, dtype)
+            return self._zeros(index, dtype, shape)
         stride = self._document.bufferViews[accessor.bufferView].byteStride or dtype.itemsize * shape[1]
         data, offset = self.view(accessor.bufferView), accessor.byteOffset or 0
         end = offset + (shape[0] - 1) * stride + dtype.itemsize * shape[1]
@@ -96,6 +96,16 @@ class Buffers:
                 f"of a buffer view with {len(data)} bytes"
             )
         return np.ndarray(shape, dtype, data, offset, (stride, dtype.itemsize))
+
+    def _zeros(self, index: int, dtype: np.dtype, shape: tuple[int, int]) -> NDArray:
+        """What an accessor without data holds; it costs no byte of the file, so that its count may be anything."""
+        most = sum(len(self._buffer(buffer)) for buffer in range(len(self._document.buffers)))
+        if shape[0] > most:
+            raise SceneError(
+                f"{self._files.path}: accessor {index} claims {shape[0]} elements without any data for them, in a file "
+                f"whose buffers hold {most} bytes"
+            )
+        return np.zeros(shape, dtype)
 
     def _with_sparse(self, sparse: pygltflib.Sparse, values: NDArray, dtype: np.dtype) -> NDArray:
         where = np.dtype(_COMPONENT[sparse.indices.componentType])
