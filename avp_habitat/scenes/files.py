@@ -92,12 +92,13 @@ def broken_link(path: Path) -> str | None:
     return f"is a link to {os.readlink(path)}, where there is no file; fetch it (dvc pull, git annex get, say)"
 
 
-def decode_picture(content: bytes, name: str) -> NDArray[np.uint8]:
-    """Pixels, `(height, width, 3)` uint8 as stored (sRGB), of an encoded picture; transparency is dropped.
+def decode_picture(content: bytes, name: str, mode: str = "RGB") -> NDArray[np.uint8]:
+    """Pixels, `(height, width, 3)` uint8 as stored (sRGB), of an encoded picture; with alpha as a fourth for RGBA.
 
     Args:
         content: an encoded PNG, JPEG or other format that Pillow reads.
         name: what to call the picture in an error.
+        mode: `RGB` or `RGBA`; greys of 16 bits, which have no alpha, have three values in both.
 
     Raises:
         SceneError: the bytes are no picture.
@@ -113,6 +114,6 @@ def decode_picture(content: bytes, name: str) -> NDArray[np.uint8]:
                 # Pillow clips 16-bit greys to 255 when it converts them, instead of scaling them.
                 grey = (np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8)
                 return np.repeat(grey[..., None], 3, axis=2)
-            return np.ascontiguousarray(image.convert("RGB"))
+            return np.ascontiguousarray(image.convert(mode))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise SceneError(f"{name}: the picture cannot be decoded: {error}") from error

@@ -72,7 +72,7 @@ class Buffers:
         values = self._dense(index, dtype, shape)
         if accessor.sparse is not None:
             values = self._with_sparse(accessor.sparse, values, dtype)
-        return _from_normalised(values) if accessor.normalized and dtype.kind in "iu" else values
+        return fractions(values) if accessor.normalized else values
 
     def _buffer(self, index: int) -> bytes:
         if index not in self._content:
@@ -117,6 +117,8 @@ class Buffers:
         return values
 
 
-def _from_normalised(values: NDArray) -> NDArray[np.float32]:
-    """Integers to fractions of their type's greatest value (glTF 2.0, section 3.11: -128 and -127 are both -1)."""
+def fractions(values: NDArray) -> NDArray:
+    """Integers as fractions of their type's greatest value (glTF 2.0, section 3.11: -128 and -127 are both -1)."""
+    if values.dtype.kind == "f":
+        return values
     return np.maximum(values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max), np.float32(-1.0))
