@@ -105,7 +105,7 @@ def _is_clear(material: pygltflib.Material) -> bool:
 def _adds_light(material: pygltflib.Material) -> bool:
     """Whether a material has an emissive picture besides the one that is shown."""
     unlit = "KHR_materials_unlit" in (material.extensions or {})
-    lit = material.emissiveTexture is not None and _light(material).any()
+    lit = material.emissiveTexture is not None and bool(_light(material).any())
     return lit and not unlit and surface_of(material).tinted
 
 
