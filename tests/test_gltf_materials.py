@@ -1,6 +1,7 @@
 """What materials of glTF files show, where MASK leaves nothing, and what is said of the rest."""
 
 import itertools
+import json
 import re
 from pathlib import Path
 
@@ -12,7 +13,9 @@ from avp_habitat.errors import SceneError
 from avp_habitat.poses import Intrinsics, camera_to_world
 from avp_habitat.scenes.export import export_glb
 from avp_habitat.scenes.loader import load_scene
+from avp_habitat.scenes.location import locate
 from avp_habitat.scenes.mesh import TexturedMesh
+from avp_habitat.simulators.habitat.stage import write_stage
 from avp_habitat.simulators.raycast import RaycastSimulator
 
 GLOSS, UNLIT, STRENGTH = (f"KHR_materials_{name}" for name in ("pbrSpecularGlossiness", "unlit", "emissive_strength"))
@@ -330,3 +333,31 @@ def test_an_exported_scene_keeps_its_holes(tmp_path):
     np.testing.assert_array_equal(
         look(RaycastSimulator(again)).depth, look(simulator(tmp_path, panes(HOLE, HOLE[:, :4]))).depth
     )
+
+
+def mirrored() -> Gltf:
+    return quad(nodes=[{"mesh": 0, "scale": [-1, 1, 1]}])
+
+
+def glowing() -> Gltf:
+    return quad(materials=[{"emissiveFactor": [1, 0.5, 0]}])
+
+
+@pytest.mark.parametrize(
+    ("document", "rewritten"),
+    [(quad(), False), (panes(HOLE), True), (mirrored(), True), (glowing(), True)],
+    ids=["plain", "masked", "mirrored", "glowing"],
+)
+def test_habitat_is_given_what_it_would_not_show_rightly_in_a_form_that_it_does(tmp_path, document, rewritten):
+    path = document.write(tmp_path)
+    (tmp_path / "stage").mkdir()
+    write_stage(path, locate(path), tmp_path / "stage")
+    asset = Path(json.loads((tmp_path / "stage/scene.stage_config.json").read_text())["render_asset"])
+    assert asset == (tmp_path / "stage/room.glb" if rewritten else Path(path))
+    assert len(load_scene(str(asset)).mesh.triangles) == len(load_scene(path).mesh.triangles)
+
+
+def test_habitat_is_given_a_file_that_only_it_reads(tmp_path):
+    path = quad(extensionsRequired=["KHR_texture_basisu"], materials=[{"alphaMode": "MASK"}]).write(tmp_path)
+    write_stage(path, locate(path), tmp_path)
+    assert json.loads((tmp_path / "scene.stage_config.json").read_text())["render_asset"] == path

@@ -50,6 +50,26 @@ def read_gltf(files: SceneFiles) -> TexturedMesh:
         raise SceneError(f"{files.path}: expected a valid glTF 2.0 file, but it is damaged: {reason}") from error
 
 
+def shown_as_it_is(files: SceneFiles) -> bool:
+    """Whether Habitat-Sim 0.3.4 shows a document's materials, and walks on its floors, as the suite does.
+
+    It draws what is masked, under flat shading leaves out what materials emit, and takes the floors below a mirroring
+    node, which it draws rightly, for ceilings (the NavMesh's mesh is joined without turning the winding over). What the
+    suite cannot read, as textures of HM3D, is left to it.
+
+    Raises:
+        SceneError: the file is damaged.
+    """
+    try:
+        document = _parse(files.main)
+        surfaces = [surface_of(material) for material in document.materials or []]
+        mirrored = any(np.linalg.det(_local_transform(node)[:3, :3]) < 0 for node in document.nodes)
+    except _MALFORMED as error:
+        raise SceneError(f"{files.path}: expected a valid glTF 2.0 file, but it is damaged: {error}") from error
+    foreign = set(document.extensionsRequired or []) - SUPPORTED
+    return bool(foreign) or not mirrored and all(surface.cutoff is None and surface.tinted for surface in surfaces)
+
+
 class _Reader:
     """One document on its way to a mesh."""
 

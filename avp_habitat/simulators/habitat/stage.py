@@ -8,7 +8,7 @@ from avp_habitat.scenes.location import SceneLocation
 from avp_habitat.scenes.stage_config import Y_UP
 
 _NAME = "scene"
-_AS_IT_IS = (".glb", ".gltf")
+_GLTF = (".glb", ".gltf")
 
 
 def write_stage(scene: str, location: SceneLocation, folder: Path) -> tuple[Path, str]:
@@ -16,7 +16,8 @@ def write_stage(scene: str, location: SceneLocation, folder: Path) -> tuple[Path
 
     A bare `.glb` would be read as Z-up, and Habitat-Sim looks beside a bare asset for a NavMesh and semantics that may
     not fit; a stage config of our own says what is meant. Of a `.ply` or `.obj` Habitat-Sim 0.3.4 shows the first mesh
-    only, without vertex colours and not turned by the config's axes, so those are written as `.glb` first. All of it
+    only, without vertex colours and not turned by the config's axes, so those are written as `.glb` first, and so is a
+    glTF that it would show otherwise than it is meant (`avp_habitat.scenes.gltf.shown_as_it_is`). All of it
     goes to `folder`, never beside the user's files. A scene with objects is opened from its own dataset.
 
     Args:
@@ -29,7 +30,7 @@ def write_stage(scene: str, location: SceneLocation, folder: Path) -> tuple[Path
     """
     if location.objects and location.dataset is not None and location.scene_id is not None:
         return Path(os.path.abspath(location.dataset)), location.scene_id
-    if location.asset is not None and location.asset.suffix.lower() in _AS_IT_IS:
+    if location.asset is not None and _is_shown_as_it_is(location.asset):
         asset, (up, front) = os.path.abspath(location.asset), (location.up, location.front)
     else:
         asset, (up, front) = _as_glb(scene, folder), Y_UP
@@ -38,6 +39,13 @@ def write_stage(scene: str, location: SceneLocation, folder: Path) -> tuple[Path
     dataset = folder / "avp.scene_dataset_config.json"
     dataset.write_text(json.dumps({"stages": {"paths": {".json": ["*.stage_config.json"]}}}), encoding="utf-8")
     return dataset, _NAME
+
+
+def _is_shown_as_it_is(asset: Path) -> bool:
+    from avp_habitat.scenes.files import SceneFiles
+    from avp_habitat.scenes.gltf import shown_as_it_is
+
+    return asset.suffix.lower() in _GLTF and shown_as_it_is(SceneFiles(asset))
 
 
 def _as_glb(scene: str, folder: Path) -> Path:
