@@ -67,7 +67,7 @@ def shown_as_it_is(files: SceneFiles) -> bool:
     except _MALFORMED as error:
         raise SceneError(f"{files.path}: expected a valid glTF 2.0 file, but it is damaged: {error}") from error
     foreign = set(document.extensionsRequired or []) - SUPPORTED
-    return bool(foreign) or not mirrored and all(surface.cutoff is None and surface.tinted for surface in surfaces)
+    return bool(foreign) or (not mirrored and all(surface.cutoff is None and surface.tinted for surface in surfaces))
 
 
 class _Reader:
