@@ -321,7 +321,7 @@ def no_last_row(folder):
         (broken_map, r"trajectory\.png: expected a readable PNG, could not decode it"),
         (nan_pose, r"poses/frame_00003\.txt: not a rigid camera_to_world: .*"),
         (stretched_pose, r"poses/frame_00003\.txt: not a rigid camera_to_world: .*"),
-        (table_not_fetched, r"steps\.csv: expected a table of steps, could not read it"),
+        (table_not_fetched, r"steps\.csv: expected a table of steps, found no such file"),
         (folder_for_table, r"steps\.csv: expected a table of steps, could not read it"),
         (no_column, r"steps\.csv: expected a column 'coverage', found action, "),
         (no_last_row, r"steps\.csv: expected one row per frame \(5\), found 4"),

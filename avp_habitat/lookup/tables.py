@@ -24,7 +24,7 @@ from avp_habitat.simulators.base import SingleRays
 
 SPACING_M = 0.1
 """Distance between lattice points in metres. At 0.2 m the least depth is off by twice as much (docs/training.md)."""
-_VERSION = 2
+_VERSION = 3
 
 
 @dataclass(frozen=True)

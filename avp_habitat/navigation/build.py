@@ -7,7 +7,7 @@ from avp_habitat.errors import SceneError
 from avp_habitat.navigation.area import Float, NavigableArea, SurfaceBelow
 from avp_habitat.navigation.boundary import largest_piece, outline
 from avp_habitat.navigation.filters import standing_places
-from avp_habitat.navigation.heightfield import Heightfield, level_triangles, voxelise
+from avp_habitat.navigation.heightfield import Heightfield, check_size, level_triangles, voxelise
 from avp_habitat.navigation.parts import Part, common_place, connected_parts, lay_flat, main_part, place_near
 from avp_habitat.navigation.settings import NavigationSettings
 from avp_habitat.navigation.walls import SKIN_M, Walls, are_inside, make_walls, off_walls
@@ -22,6 +22,7 @@ def build(
 ) -> NavigableArea:
     """See `avp_habitat.navigation.area.build_area`."""
     vertices, triangles = _used(mesh)
+    check_size(vertices, settings)
     _check_floor(vertices, triangles, settings)
     field = voxelise(vertices, triangles, settings)
     places = standing_places(field, settings)

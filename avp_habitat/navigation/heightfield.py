@@ -55,25 +55,32 @@ def level_triangles(
     return np.where(normal[:, 1] > least, UPWARDS, np.where(-normal[:, 1] > least, DOWNWARDS, 0))
 
 
-def voxelise(vertices: NDArray[np.float32], triangles: NDArray[np.int32], settings: NavigationSettings) -> Heightfield:
-    """Voxelise a mesh.
-
-    Args:
-        vertices: `(v, 3)` metres, Y up, finite.
-        triangles: `(t, 3)` vertex indices.
-        settings: voxel sizes, slope and climb.
+def check_size(vertices: NDArray[np.float32], settings: NavigationSettings) -> None:
+    """Refuse a mesh of which no voxels can be made, before any arithmetic on it overflows.
 
     Raises:
         SceneError: the mesh is so wide that its columns would not fit into memory; it is not in metres.
     """
+    width, height, depth = vertices.max(axis=0).astype(np.float64) - vertices.min(axis=0)
+    most = _MOST_COLUMNS * settings.voxel_m**2
+    if width * depth > most or max(width, height, depth) > most:
+        raise SceneError(
+            f"the scene measures {width:.6g} x {height:.6g} x {depth:.6g} m (x, y, z): expected at most {most:.0f} m² "
+            "of floor; is it in millimetres or centimetres instead of metres?"
+        )
+
+
+def voxelise(vertices: NDArray[np.float32], triangles: NDArray[np.int32], settings: NavigationSettings) -> Heightfield:
+    """Voxelise a mesh.
+
+    Args:
+        vertices: `(v, 3)` metres, Y up, finite, of a size that `check_size` passes.
+        triangles: `(t, 3)` vertex indices.
+        settings: voxel sizes, slope and climb.
+    """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     cell, level = np.float32(settings.voxel_m), np.float32(settings.voxel_height_m)
     columns, rows = (max(1, int((high[axis] - low[axis]) / cell + np.float32(0.5))) for axis in (0, 2))
-    if rows * columns > _MOST_COLUMNS:
-        raise SceneError(
-            f"the scene is {high[0] - low[0]:.0f} x {high[2] - low[2]:.0f} m wide: expected at most "
-            f"{_MOST_COLUMNS * settings.voxel_m**2:.0f} m²; is it in millimetres or centimetres instead of metres?"
-        )
     level_enough = level_triangles(vertices, triangles, settings.max_slope_deg)
     first, bottom, top, bits = _rasterise(
         vertices, triangles, level_enough, low, high, cell, level, rows, columns, settings.climb_voxels

@@ -67,6 +67,24 @@ class SceneFiles:
             raise SceneError(f"{path}{owner}: {broken_link(path) or f'cannot be read: {error.strerror}'}") from error
 
 
+def check_memory(name: str, needed: int) -> None:
+    """Refuse what would not fit into the memory that is free, before it is asked for.
+
+    Args:
+        name: of the file, and what in it is meant.
+        needed: bytes.
+
+    Raises:
+        SceneError: it does not fit.
+    """
+    try:
+        free = 1024 * int(Path("/proc/meminfo").read_text().partition("MemAvailable:")[2].split()[0])
+    except (OSError, LookupError):
+        free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if needed > free:
+        raise SceneError(f"{name} takes {needed / 1e9:.1f} GB of memory, of which {free / 1e9:.1f} GB are free")
+
+
 def broken_link(path: Path) -> str | None:
     """What is wrong with a link that leads nowhere, as where a store's content was not fetched; None for others."""
     if not path.is_symlink() or path.exists():
@@ -74,12 +92,13 @@ def broken_link(path: Path) -> str | None:
     return f"is a link to {os.readlink(path)}, where there is no file; fetch it (dvc pull, git annex get, say)"
 
 
-def decode_picture(content: bytes, name: str) -> NDArray[np.uint8]:
-    """Pixels, `(height, width, 3)` uint8 as stored (sRGB), of an encoded picture; transparency is dropped.
+def decode_picture(content: bytes, name: str, mode: str = "RGB") -> NDArray[np.uint8]:
+    """Pixels, `(height, width, 3)` uint8 as stored (sRGB), of an encoded picture; with alpha as a fourth for RGBA.
 
     Args:
         content: an encoded PNG, JPEG or other format that Pillow reads.
         name: what to call the picture in an error.
+        mode: `RGB` or `RGBA`; greys of 16 bits, which have no alpha, have three values in both.
 
     Raises:
         SceneError: the bytes are no picture.
@@ -88,10 +107,13 @@ def decode_picture(content: bytes, name: str) -> NDArray[np.uint8]:
 
     try:
         with Image.open(io.BytesIO(content)) as image:
+            check_memory(
+                f"{name}: its picture of {image.width} x {image.height} pixels", 8 * image.width * image.height
+            )
             if image.mode.startswith("I"):
                 # Pillow clips 16-bit greys to 255 when it converts them, instead of scaling them.
                 grey = (np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8)
                 return np.repeat(grey[..., None], 3, axis=2)
-            return np.ascontiguousarray(image.convert("RGB"))
+            return np.ascontiguousarray(image.convert(mode))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise SceneError(f"{name}: the picture cannot be decoded: {error}") from error
