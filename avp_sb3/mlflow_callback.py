@@ -18,6 +18,7 @@ from avp_habitat.errors import UsageError
 from avp_habitat.provenance import flat
 from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, shown
 from avp_habitat.tracking.journal import spool_folder
+from avp_habitat.tracking.looking import about_run
 from avp_habitat.tracking.opening import NewRun, continue_run, join_run, may_continue, start_run
 from avp_habitat.tracking.recovery import recover_in_background
 from avp_habitat.tracking.run import Status, TrackedRun
@@ -71,7 +72,7 @@ class MLflowCallback(BaseCallback):
         offline: bool | None = None,
         params: Mapping[str, Any] | None = None,
         tags: Mapping[str, str] | None = None,
-        verbose: int = 0,
+        verbose: int = 1,
     ) -> None:
         """Describe the run; nothing is contacted before the training starts.
 
@@ -89,7 +90,7 @@ class MLflowCallback(BaseCallback):
                 omitted, as the variable `AVP_MLFLOW_OFFLINE` says.
             params: further parameters; nested mappings become dotted names.
             tags: further tags.
-            verbose: 1 prints where the run is.
+            verbose: 1 prints at the end which run it was and how to look at it, 2 also at the start; 0 prints nothing.
 
         Raises:
             UsageError: a number that cannot be right.
@@ -138,8 +139,10 @@ class MLflowCallback(BaseCallback):
         finally:
             if self._writer in self.logger.output_formats:
                 self.logger.output_formats.remove(self._writer)
-            run.close(status)
+            delivered = run.close(status)
             self._remember(run)
+            if self.verbose:
+                print(about_run(run.run_id, run.address, delivered=delivered), flush=True)
 
     def _on_training_start(self) -> None:
         self.close("KILLED")
@@ -159,8 +162,8 @@ class MLflowCallback(BaseCallback):
         recovery = recover_in_background(spool_folder())
         # The usual case, a store on this machine, is a matter of milliseconds; a slow server is not waited for.
         recovery.join(0.5)
-        if self.verbose:
-            print(f"MLflow run {run.run_id} at {shown(run.address)}")
+        if self.verbose > 1:
+            print(f"MLflow:   run {run.run_id} at {shown(run.address)}", flush=True)
 
     def _on_rollout_start(self) -> None:
         # Here the model is as it was after its last update, for which the step count stands.

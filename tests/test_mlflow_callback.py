@@ -284,7 +284,7 @@ ppo(Ending()).learn(256, callback=[MetricsCallback(), MLflowCallback("exits", {s
         [sys.executable, "-c", script], env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True
     )
     assert done.returncode in (1, -signal.SIGINT), done.stderr
-    run_id = done.stdout.split("MLflow run ")[1].split()[0]
+    run_id = done.stdout.split("MLflow:   run ")[1].split()[0]
     assert client.get_run(run_id).info.status == status, done.stderr
     assert [point.step for point in client.get_metric_history(run_id, "avp/coverage")] == [64, 99]
 
