@@ -55,11 +55,12 @@ def number(name: str, value: Any, kind: type, limits: Range) -> Any:
     """
     whole = kind is int
     # Truth values are whole numbers to Python, and texts none.
-    fits = isinstance(value, Real) and not isinstance(value, bool) and limits.least <= value <= limits.most
-    if not fits or (whole and value % 1):
+    real = isinstance(value, Real) and not isinstance(value, bool)
+    given: Any = value
+    if not real or not limits.least <= given <= limits.most or (whole and given % 1):
         expected = f"a {'whole ' if whole else ''}number from {limits.least:,g} to {limits.most:,g}"
         raise UsageError(f"{name}: expected {expected}, got {value!r}")
-    return kind(value)
+    return kind(given)
 
 
 @cache

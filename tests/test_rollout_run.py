@@ -109,6 +109,18 @@ def test_the_run_is_a_child_of_the_run_that_trained_the_policy_in_its_experiment
     assert run.info.run_name == "rollout model.zip coverage builtin:0 seed 7"
 
 
+def test_without_a_policys_run_mlflows_variable_names_the_experiment(rollout, store, monkeypatch):
+    monkeypatch.setenv("MLFLOW_EXPERIMENT_NAME", "mine")
+    run = store.get_run(rollout_run(store, rollout))
+    assert store.get_experiment(run.info.experiment_id).name == "mine"
+
+
+def test_a_deleted_experiment_is_named_before_a_run_is_made(rollout, store):
+    store.delete_experiment(store.create_experiment("gone"))
+    with pytest.raises(TrackingError, match="MLflow experiment 'gone' at .* is deleted; .*mlflow experiments restore"):
+        rollout_run(store, rollout, experiment="gone")
+
+
 def test_a_policy_run_that_the_store_does_not_have_is_named_only(rollout, store):
     tell(rollout, mlflow_run_id="0" * 32)
     run = store.get_run(rollout_run(store, rollout, experiment="mine"))
