@@ -28,8 +28,8 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         except RuntimeError as error:
             if "cannot cache function" not in str(error):
                 raise
-        kept = {"cache": True} if _elsewhere() is not None else {}
-        return numba.njit(**{**options, "cache": False, **kept})(function)
+        again: dict[str, Any] = {**options, "cache": _elsewhere() is not None}
+        return numba.njit(**again)(function)
 
     return compiled
 

@@ -2,53 +2,60 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.ranges import Range, hold_ranges
 
 Float = NDArray[np.floating]
 Number = NDArray[np.number]
 Bool = NDArray[np.bool_]
+Amount = Annotated[float, Range(0, 1000)]
 
 
 @dataclass(frozen=True)
 class RewardConstants:
     """The constants of all rewards; the paper gives none, so these are ours and the same for every scene."""
 
-    alpha: float = 0.004
+    alpha: Amount = 0.004
     """α of `coverage` and `coverage_redundancy`: reward per newly observed cell (0.01 m²)."""
-    alpha_proposed: float = 0.0088
+    alpha_proposed: Amount = 0.0088
     """α of `proposed`: reward per (newly observed cell)^β."""
-    alpha_surface: float = 0.0045
+    alpha_surface: Amount = 0.0045
     """α of `surface`: reward per (newly seen surface point)^β, each weighted by how well it is seen (`surfaces`)."""
-    beta: float = 0.9
+    beta: Annotated[float, Range(0, 1)] = 0.9
     """β of `proposed` and `surface`, no unit, below 1: much that is new at once counts less than step after step."""
-    visit_decay: float = 0.5
+    visit_decay: Amount = 0.5
     """Weight of earlier visits v in α / (1 + 0.5·v), per visit."""
-    spread: float = 0.002
+    spread: Amount = 0.002
     """λ_s: reward per metre between the agent and the mean of the positions it visited."""
-    spread_limit_m: float = 3.0
+    spread_limit_m: Amount = 3.0
     """r_max in metres: more distance than this earns nothing more."""
-    step: float = 0.045
+    step: Amount = 0.045
     """P_step: cost of each step."""
-    collision: float = 0.05
+    collision: Amount = 0.05
     """P_collision: cost of a forward move that was blocked."""
-    redundancy: float = 0.03
+    redundancy: Amount = 0.03
     """P_redundancy: cost of a view like an earlier one."""
-    redundancy_distance_m: float = 0.2
+    redundancy_distance_m: Amount = 0.2
     """d_red in metres: below one forward move, so that walking on is never redundant."""
-    redundancy_angle_deg: float = 5.0
+    redundancy_angle_deg: Annotated[float, Range(0, 180)] = 5.0
     """δ in degrees, for yaw and pitch alike: below one turn, so that turning on is never redundant."""
-    stop_bonus: float = 1.0
+    stop_bonus: Amount = 1.0
     """B_s: reward of stopping with enough coverage."""
-    stop_per_step_left: float = 0.01
+    stop_per_step_left: Amount = 0.01
     """λ_e: further reward per step of the budget that was not used."""
-    early_stop: float = 0.02
+    early_stop: Amount = 0.02
     """Cost of choosing stop with too little coverage."""
-    stop_coverage: float = 0.85
+    stop_coverage: Annotated[float, Range(0, 1)] = 0.85
     """τ: the coverage from which stop ends the episode, within [0, 1]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is outside its range."""
+        hold_ranges(self)
 
 
 @dataclass(frozen=True)

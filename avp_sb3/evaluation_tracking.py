@@ -15,6 +15,7 @@ from mlflow.exceptions import MlflowException
 from mlflow.tracking.context.registry import resolve_tags
 from numpy.typing import NDArray
 
+from avp_habitat.metrics import explained
 from avp_habitat.provenance import flat
 from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, TrackingError, connect, first_line, shown
 from avp_habitat.tracking.experiments import experiment_id, meant
@@ -28,6 +29,7 @@ TABLE = "policies.json"
 """Artifact of the upper run that MLflow's page shows as a table."""
 KIND_TAG, KIND = "avp.kind", "evaluation"
 _TOLD = ("policy", "coverage [%]", "views", "CpV [%/view]", "ended by a stop [%]", "episodes")
+_TERMS = f"{explained('coverage', 'views', 'CpV', 'stop')}."
 _PREFIX = "eval"
 _MAX_PARAM, _MAX_TAG = 6000, 5000
 
@@ -136,7 +138,7 @@ def _log_table(client: MlflowClient, run: str, results: Sequence[PolicyResult], 
     told = {title: columns[title] for title in _TOLD if title in columns}
     rows = [told, ["---"] * len(told), *zip(*told.values(), strict=True)]
     lines = [f"| {' | '.join(row)} |" for row in rows]
-    note = "\n".join([*lines, "", "Means over the episodes; ± is half of the 95 % interval."])
+    note = "\n".join([*lines, "", "Means over the episodes; ± is half of the 95 % interval.", "", _TERMS])
     client.set_tag(run, NOTE_TAG, note[:_MAX_TAG])
 
 

@@ -96,7 +96,7 @@ class MLflowCallback(BaseCallback):
             UsageError: a number that cannot be right.
         """
         super().__init__(verbose)
-        if checkpoint_s <= 0:
+        if not checkpoint_s > 0:
             raise UsageError(f"MLflowCallback checkpoint_s: expected seconds above 0, got {checkpoint_s}")
         self.run_id: str | None = None
         self._new = NewRun(experiment=experiment, name=run_name)

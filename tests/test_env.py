@@ -226,6 +226,8 @@ def test_agents_walk_in_their_own_scenes_as_if_alone():
 @pytest.mark.parametrize(
     ("scenes", "agents", "words"),
     [
+        ("builtin:0", 2.5, "agents: expected a whole number from 0 to"),
+        ("builtin:0", float("nan"), "agents: expected a whole number from 0 to"),
         (["builtin:0", "builtin:3"], 1, "agents: expected at least 2, one for each scene, got 1"),
         ([], 1, "scene: expected at least one, got none"),
         ("builtin:0", 10**9, r"agents: 1000000000 need about \d+\.\d GiB, \d+\.\d GiB are free"),

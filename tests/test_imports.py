@@ -25,6 +25,7 @@ LIGHT = (
     "observation",
     "trajectory",
     "errors",
+    "ranges",
 )
 ONE_FILE = {"habitat_sim": "simulators/habitat/engine.py", "open3d": "simulators/raycast.py"}
 NOT_AT_IMPORT = ("torch", "open3d", "habitat_sim", "mlflow", "rerun", "numba", "stable_baselines3", "trimesh", "scipy")

@@ -450,3 +450,10 @@ def test_an_application_logs_a_rollout_into_its_own_recording(rollout, tmp_path)
     assert stores(target) == [("host", "session")]
     assert actions(target, "/shown") == list(ACTIONS)
     assert [time for time, _ in rows(target, "/shown/plots/action", ADDED, "frame")] == [7] * len(ACTIONS)
+
+
+@pytest.mark.parametrize("flag", ["--application-id", "--recording-id", "--entity-path-prefix"])
+def test_names_that_are_no_text_are_refused_by_option(call, rollout, flag):
+    code, recording, err = call(rollout, flag, os.fsdecode(b"a\xff"))
+    assert (code, recording) == (2, None)
+    assert err.splitlines() == [f"error: {flag}: expected a text, got 'a\\udcff'"]

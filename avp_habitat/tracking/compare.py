@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
+from avp_habitat.metrics import explained
 from avp_habitat.tracking.addresses import (
     DEFAULT_ADDRESS,
     TrackingError,
@@ -42,8 +43,10 @@ TABLE, MARKDOWN, PICTURE = "comparison.json", "comparison.md", "comparison.png"
 NAME = "comparison"
 _NOTE = "mlflow.note.content"
 _MAX_TAG = 5000
-_HOW_TO_READ = """
+_HOW_TO_READ = f"""
 More PSNR and SSIM are better, less LPIPS; fewer views are better. Means over the runs; ± is half of the 95 % interval.
+
+{explained("coverage", "CpV", "visibility", "PSNR", "SSIM", "LPIPS")}.
 """
 
 

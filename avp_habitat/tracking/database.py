@@ -21,9 +21,9 @@ def fault_of(path: Path) -> str | None:
     """Why MLflow could not use a file, existing or not; None when it can. MLflow itself tries ten times for that."""
     if path.is_dir():
         return "it is a folder"
-    with suppress(OSError):
-        # A file that cannot be read is named below.
-        if path.exists() and path.open("rb").read(len(_MAGIC)) not in (b"", _MAGIC):
+    # A file that cannot be read is named below.
+    with suppress(OSError), path.open("rb") as file:
+        if file.read(len(_MAGIC)) not in (b"", _MAGIC):
             return "it is no SQLite database"
     folder = next(parent for parent in path.parents if parent.exists())
     if not folder.is_dir():
