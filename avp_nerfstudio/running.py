@@ -14,11 +14,10 @@ from typing import Any
 import torch
 
 from avp_habitat.errors import AVPError, RolloutError
+from avp_habitat.gpu import WITHOUT_GPU
 
 _OUTPUTS = Path("outputs")
 _LOADING = ("eval_setup", "open_trained")
-_SMALLEST = ["--machine.device-type", "cpu"]
-_PLAIN = ["--pipeline.model.implementation", "torch"]
 
 
 class DeviceError(AVPError):
@@ -59,8 +58,7 @@ def check_device(data: Path) -> None:
     ours = f"`{shlex.join(['ns-train', 'avp-nerfacto', '--data', str(data)])}`"
     on_cpu = ""
     if hasattr(config.pipeline.model, "implementation"):  # the others need compiled CUDA code
-        words = _words_on_cpu(str(config.method_name)) or [str(config.method_name), *_SMALLEST, *_PLAIN, "avp-data"]
-        words += [] if "--data" in words else ["--data", str(data)]
+        words = _words_on_cpu(str(config.method_name), data)
         on_cpu = f", or (seconds per iteration) `{shlex.join(['ns-train', *words])}`"
     raise DeviceError(
         f"{config.method_name} trains on a GPU by default, and none was found here (torch {torch.__version__} is built "
@@ -68,14 +66,13 @@ def check_device(data: Path) -> None:
     )
 
 
-def _words_on_cpu(method: str) -> list[str]:
-    """The options of the `ns-train` that is running, with those for a CPU; none when that is another program."""
-    words = sys.argv[1:]
-    if method not in words or any("device-type" in word or "device_type" in word for word in words):
-        return []
+def _words_on_cpu(method: str, data: Path) -> list[str]:
+    """The words after `ns-train`, with those for a CPU: as they were typed, if it is `ns-train` that is running."""
+    options, words = WITHOUT_GPU.split(), sys.argv[1:]
+    if method not in words or any(option.strip("-") in word for option in options[::2] for word in words):
+        return [method, *options, "avp-data", "--data", str(data)]
     after = words.index(method) + 1
-    plain = [] if any("implementation" in word for word in words) else _PLAIN
-    return [*words[:after], *_SMALLEST, *plain, *words[after:]]
+    return [*words[:after], *options, *words[after:]]
 
 
 def check_is_there(path: Path) -> None:
