@@ -1,19 +1,16 @@
-"""The four rewards of the task as sums of named parts, for n agents at a time."""
+"""The rewards of the task as sums of named parts, for n agents at a time."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.errors import unknown_name
+from avp_habitat.errors import UsageError, unknown_name
 
 Float = NDArray[np.floating]
 Number = NDArray[np.number]
 Bool = NDArray[np.bool_]
-
-PARTS = ("coverage", "surface", "spread", "step", "collision", "redundancy", "stop")
-"""Names of the parts; every reward returns all of them, zero where it has no such term."""
 
 
 @dataclass(frozen=True)
@@ -85,21 +82,25 @@ def _coverage(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]
 
 def _coverage_redundancy(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """Eq. 25: α·Δc + λ_s·min(‖p − p̄‖, r_max) − P_redundancy − P_collision."""
-    return _coverage(facts, constants) | _dispersion(facts, constants)
+    return {
+        "coverage": constants.alpha * facts.new_cells,
+        "spread": _spread(facts, constants),
+        "collision": -constants.collision * facts.collided,
+        "redundancy": -constants.redundancy * facts.redundant,
+    }
 
 
 def _proposed(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """Eq. 19–22: sublinear, visit-discounted coverage with dispersion, step cost and a learned stop."""
-    return _with_ends(facts, constants) | {
-        "coverage": _new(facts.new_cells, constants.alpha_proposed, facts, constants)
-    }
+    new = {"coverage": _new(facts.new_cells, constants.alpha_proposed, facts, constants)}
+    return new | _with_ends(facts, constants)
 
 
 def _surface(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """`proposed` with new surface ΔS in place of new cells Δc."""
-    return _with_ends(facts, constants) | {
-        "surface": _new(facts.new_surface, constants.alpha_surface, facts, constants)
-    }
+    return {"surface": _new(facts.new_surface, constants.alpha_surface, facts, constants)} | _with_ends(
+        facts, constants
+    )
 
 
 def _new(amount: Number, alpha: float, facts: StepFacts, constants: RewardConstants) -> Number:
@@ -111,27 +112,28 @@ def _with_ends(facts: StepFacts, constants: RewardConstants) -> dict[str, Number
     """What `proposed` and `surface` share: dispersion, costs and the stop."""
     success = constants.stop_bonus + constants.stop_per_step_left * facts.steps_left
     stop = np.where(stops_episode(facts, constants), success, -constants.early_stop)
-    return _dispersion(facts, constants) | {
+    return {
+        "spread": _spread(facts, constants),
         "step": np.full(len(facts.coverage), -constants.step),
         "collision": -constants.collision * facts.collided,
+        "redundancy": -constants.redundancy * facts.redundant,
         "stop": np.where(facts.stop_chosen, stop, 0.0),
     }
 
 
-def _dispersion(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
-    return {
-        "spread": constants.spread * np.minimum(facts.spread_m, constants.spread_limit_m),
-        "redundancy": -constants.redundancy * facts.redundant,
-    }
+def _spread(facts: StepFacts, constants: RewardConstants) -> Number:
+    return constants.spread * np.minimum(facts.spread_m, constants.spread_limit_m)
 
 
-_REWARDS: dict[str, Callable[[StepFacts, RewardConstants], dict[str, Number]]] = {
+REWARDS: dict[str, Callable[[StepFacts, RewardConstants], Mapping[str, Number | float]]] = {
     "coverage": _coverage,
     "coverage_redundancy": _coverage_redundancy,
     "proposed": _proposed,
     "surface": _surface,
 }
-REWARD_NAMES = tuple(_REWARDS)
+"""By name: what gives a step's parts, each one number per agent or one for all; their sum is the reward. The parts
+may have any names, and a step may leave some out. A further entry is a further reward."""
+REWARD_NAMES = tuple(REWARDS)
 _WITH_STOP = frozenset({"proposed", "surface"})
 
 
@@ -141,7 +143,7 @@ def check_reward(name: str) -> str:
     Raises:
         UsageError: it is not; the text names the nearest one.
     """
-    if name not in _REWARDS:
+    if name not in REWARDS:
         raise unknown_name("reward", name, REWARD_NAMES)
     return name
 
@@ -157,7 +159,7 @@ def stops_episode(facts: StepFacts, constants: RewardConstants) -> Bool:
 
 
 def reward_parts(name: str, facts: StepFacts, constants: RewardConstants) -> dict[str, NDArray[np.float64]]:
-    """The parts of a reward, `(n,)` each, in the order of `PARTS`; the reward is their sum.
+    """The parts of a reward, `(n,)` each, as its function names them; the reward is their sum.
 
     Args:
         name: one of `REWARD_NAMES`.
@@ -165,8 +167,14 @@ def reward_parts(name: str, facts: StepFacts, constants: RewardConstants) -> dic
         constants: of all rewards.
 
     Raises:
-        UsageError: no such reward.
+        UsageError: no such reward, or a part is neither one number for each agent nor one for all of them.
     """
-    parts = _REWARDS[check_reward(name)](facts, constants)
-    zero = np.zeros(len(facts.coverage))
-    return {part: np.asarray(parts.get(part, zero), dtype=np.float64) for part in PARTS}
+    parts = REWARDS[check_reward(name)](facts, constants)
+    return {part: _for_each(len(facts.coverage), value, f"{name}: part {part!r}") for part, value in parts.items()}
+
+
+def _for_each(agents: int, value: Number | float, what: str) -> NDArray[np.float64]:
+    numbers = np.asarray(value, dtype=np.float64)
+    if numbers.shape not in ((), (agents,)):
+        raise UsageError(f"reward {what}: expected one number for each of {agents} agents, got shape {numbers.shape}")
+    return np.full(agents, numbers) if numbers.ndim == 0 else numbers

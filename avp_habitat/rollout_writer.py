@@ -66,7 +66,7 @@ class RolloutWriter:
         self._add(HELDOUT, rgb, depth, pose)
 
     def add_step(self, row: Mapping[str, Any]) -> None:
-        """Remember the next row of `steps.csv`; all rows have the same keys."""
+        """Remember the next row of `steps.csv`; a key that only some rows have is 0 in the others."""
         self._steps.append(dict(row))
 
     def views(self, *, heldout: bool) -> list[View]:
@@ -153,7 +153,8 @@ class RolloutWriter:
 
     def _write_steps(self) -> None:
         with self.path("steps.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, fieldnames=list(self._steps[0]) if self._steps else [])
+            names = dict.fromkeys(name for row in self._steps for name in row)
+            writer = csv.DictWriter(file, fieldnames=list(names), restval=0)
             writer.writeheader()
             writer.writerows(self._steps)
 

@@ -17,6 +17,7 @@ from avp_habitat.errors import UsageError
 from avp_habitat.provenance import flat
 from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, DEFAULT_EXPERIMENT, shown
 from avp_habitat.tracking.journal import spool_folder
+from avp_habitat.tracking.looking import about_run
 from avp_habitat.tracking.opening import NewRun, continue_run, join_run, may_continue, start_run
 from avp_habitat.tracking.recovery import recover_in_background
 from avp_habitat.tracking.run import Status, TrackedRun
@@ -28,7 +29,7 @@ from avp_sb3.run_facts import hyperparameters, scene_tags, task_settings
 if TYPE_CHECKING:
     from avp_habitat.trajectory import Trajectory
 
-MODEL_FILE = "model.zip"
+MODEL_FILE, STATISTICS_FILE = "model.zip", "model_vecnormalize.pkl"
 PARAMS_FILE = "params.json"
 TRAJECTORY_FILE = "trajectory.png"
 _log = logging.getLogger(__name__)
@@ -70,7 +71,7 @@ class MLflowCallback(BaseCallback):
         offline: bool | None = None,
         params: Mapping[str, Any] | None = None,
         tags: Mapping[str, str] | None = None,
-        verbose: int = 0,
+        verbose: int = 1,
     ) -> None:
         """Describe the run; nothing is contacted before the training starts.
 
@@ -80,13 +81,14 @@ class MLflowCallback(BaseCallback):
             tracking_uri: where runs are kept; when omitted, what `mlflow.set_tracking_uri` or `MLFLOW_TRACKING_URI`
                 say, else `sqlite:///mlflow.db` in the current folder.
             run_id: go on with this run; when omitted, with the model's own if it was interrupted.
-            log_model: keep the model as artifact `model.zip`, at the end unless the training failed, and on the way.
+            log_model: keep the model as artifact `model.zip`, at the end unless the training failed, and on the way;
+                with `model_vecnormalize.pkl` where it trains under `VecNormalize`.
             checkpoint_s: seconds between two models that are kept on the way, each in place of the one before.
             offline: True goes on when the server does not answer at the start, and sends everything later; when
                 omitted, as the variable `AVP_MLFLOW_OFFLINE` says.
             params: further parameters; nested mappings become dotted names.
             tags: further tags.
-            verbose: 1 prints where the run is.
+            verbose: 1 prints at the end which run it was and how to look at it, 2 also at the start; 0 prints nothing.
 
         Raises:
             UsageError: a number that cannot be right.
@@ -135,8 +137,10 @@ class MLflowCallback(BaseCallback):
         finally:
             if self._writer in self.logger.output_formats:
                 self.logger.output_formats.remove(self._writer)
-            run.close(status)
+            delivered = run.close(status)
             self._remember(run)
+            if self.verbose:
+                print(about_run(run.run_id, run.address, delivered=delivered), flush=True)
 
     def _on_training_start(self) -> None:
         self.close("KILLED")
@@ -156,8 +160,8 @@ class MLflowCallback(BaseCallback):
         recovery = recover_in_background(spool_folder())
         # The usual case, a store on this machine, is a matter of milliseconds; a slow server is not waited for.
         recovery.join(0.5)
-        if self.verbose:
-            print(f"MLflow run {run.run_id} at {shown(run.address)}")
+        if self.verbose > 1:
+            print(f"MLflow:   run {run.run_id} at {shown(run.address)}", flush=True)
 
     def _on_rollout_start(self) -> None:
         # Here the model is as it was after its last update, for which the step count stands.
@@ -225,6 +229,8 @@ class MLflowCallback(BaseCallback):
 
     def _save_model(self, run: TrackedRun) -> None:
         if self._log_model:
+            if (normalised := self.model.get_vec_normalize_env()) is not None:
+                run.save(STATISTICS_FILE, lambda file: normalised.save(str(file)))
             run.save(MODEL_FILE, self.model.save)
 
     def _save_trajectory(self, run: TrackedRun) -> None:
