@@ -14,11 +14,13 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from nerfstudio.data.scene_box import SceneBox
 from numpy.typing import NDArray
 
-from avp_habitat.errors import RolloutError
+from avp_habitat.errors import AVPError, RolloutError
 from avp_habitat.images import DEPTH_UNIT_M
 from avp_habitat.poses import Intrinsics, y_up_to_z_up
 from avp_habitat.rollout import Rollout, View, name_of
+from avp_nerfstudio.foreign import check_is_rollout
 from avp_nerfstudio.merging import read_merged
+from avp_nerfstudio.running import check_device, check_is_there, discard_outputs
 from avp_nerfstudio.seen_points import SeenPoints, scene_box, seen_points, subset
 from avp_nerfstudio.selection import Order, chosen_views
 from avp_nerfstudio.verification import verify_pictures
@@ -99,14 +101,19 @@ class AVPDataParser(DataParser):
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
         try:
+            check_device(self.config.data)
             return self._outputs(split)
-        except RolloutError as error:
+        except AVPError as error:
+            discard_outputs()
             raise UnusableRolloutError(str(error)) from None
 
     @functools.cached_property
     def _parsed(self) -> _Parsed:
         config = self.config
         _check_options(config)
+        for path in (config.data, *config.also):
+            check_is_there(path)
+            check_is_rollout(path)
         rollout = read_merged(config.data, config.also)
         frames = chosen_views(rollout.frames, every=config.every, max_views=config.max_views, order=config.order)
         if not frames:

@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from avp_habitat import command
 from avp_habitat.errors import RolloutError, UsageError
+from avp_habitat.metrics import TERMS, explained
 from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, address_of
 from avp_habitat.tracking.early import open_store
 from avp_habitat.tracking.experiments import DEFAULT_HELP
@@ -265,6 +266,7 @@ def main(argv: Sequence[str]) -> None:
     logged = log(request)
     for name, value in logged.scores.items():
         print(f"  {name:<20} {value:.4f}")
+    print(explained(*(name.upper() for name in logged.scores if name.upper() in TERMS)))
     print(f"pictures and table: {logged.table.parent}")
     if request.rerun is not None:
         print(f"recording:          rerun {shlex.quote(str(request.rerun))}")

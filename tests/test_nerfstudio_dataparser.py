@@ -329,7 +329,9 @@ def test_a_picture_that_cannot_be_decoded_is_named(broken):
 def test_of_a_long_rollout_few_pictures_are_decoded_and_it_is_read_once_for_all_splits(tmp_path, monkeypatch):
     folder = write_room(tmp_path / "long", width=8, height=6, frames=3 * MOST_VIEWS)
     opened = []
-    monkeypatch.setattr(Image, "open", lambda path, real=Image.open: opened.append(path) or real(path))
+    monkeypatch.setattr(
+        Image, "open", lambda path, real=Image.open, **options: opened.append(path) or real(path, **options)
+    )
     parser = AVPDataParserConfig(data=folder, verify=False).setup()
     train = parser.get_dataparser_outputs("train")
     assert len(opened) == len(set(opened)) == 2 * MOST_VIEWS

@@ -19,6 +19,7 @@ from avp_habitat.simulators.options import add_up_option
 from avp_nerfstudio.check.outputs import choose_folder, outputs_of_geometry, write_outputs
 from avp_nerfstudio.check.shape import check_format
 from avp_nerfstudio.check.verdict import Verdict
+from avp_nerfstudio.foreign import check_is_rollout
 
 
 class CheckFailedError(AVPError):
@@ -134,6 +135,7 @@ def _request(argv: Sequence[str]) -> Request:
     folder = options.rollout.parent if options.rollout.name == "rollout.json" else options.rollout
     if not folder.is_dir():
         raise UsageError(f"{folder}: expected a rollout folder (made by `python -m avp_habitat.collect`), found none")
+    check_is_rollout(folder)
     if options.export_colmap is not None and options.export_colmap.exists():
         raise UsageError(f"--export-colmap {options.export_colmap}: exists already, expected a new folder")
     return Request(
