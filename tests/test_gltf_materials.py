@@ -245,7 +245,9 @@ def test_single_rays_agree_with_the_picture(tmp_path):
     pose = camera_to_world(origin, yaw=np.full(2, -np.pi / 2), pitch=np.zeros(2))
     points = origin + [3.0, 0, 0]
     pairs = np.array([[0, 0], [1, 1], [0, 1]])
-    assert sim.visible(pose, points, pairs, tolerance_m=0.1).tolist() == [False, True, False]
+    assert sim.reached(origin, points, pairs, tolerance_m=0.1).tolist() == [False, True, False]
+    camera = Intrinsics.from_hfov(64, 48, hfov_deg=60)
+    assert sim.visible(pose, camera, points, pairs[:2], tolerance_m=0.1).tolist() == [False, True]
 
 
 def test_one_walks_through_the_hole_and_not_through_the_pane(tmp_path):
