@@ -144,7 +144,7 @@ def test_places_reach_points_in_every_direction(simulator):
 
 def test_planners_that_know_the_scene_plan_in_either(simulator, monkeypatch):
     """The lattice is that of the geometry; what is planned is what the episode then counts."""
-    if isinstance(simulator, AdapterOverRays):  # For which each of a panorama's pixels costs a ray.
+    if not isinstance(simulator, SingleRays):  # It looks around with pictures, each of whose pixels costs a ray here.
         monkeypatch.setattr("avp_habitat.oracle.lattice._PANORAMAS", 12)
     env = AVPEnv(simulator=simulator, budget=12, reward="coverage", width=32, height=24)
     lattice = lattice_of(simulator, env.settings)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _FOCAL_PX, _MOST_PX = 320.0, 1280
 """Points are looked for in images of about this focal length, that of 640x480 pixels at 90°, unless that is larger."""
-_CAMERAS_PER_CALL = 64
+_CAMERAS_PER_CALL = 32
 
 
 class HabitatSimulator:
