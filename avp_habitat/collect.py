@@ -14,11 +14,14 @@ from tqdm import tqdm
 from avp_habitat import command
 from avp_habitat.env import AVPEnv
 from avp_habitat.episode import steps_of
-from avp_habitat.errors import UsageError
+from avp_habitat.errors import RolloutError, UsageError
+from avp_habitat.gpu import nerfacto_line
 from avp_habitat.heldout import VIEWS
-from avp_habitat.policies import POLICY_NAMES, Policy, check_policy
+from avp_habitat.new_folder import check_writable
+from avp_habitat.policies import POLICY_NAMES, TRUSTED, Policy, check_policy, described
 from avp_habitat.policy_env import make_policy_env
 from avp_habitat.poses import Intrinsics
+from avp_habitat.progress import progress
 from avp_habitat.rewards import REWARD_NAMES
 from avp_habitat.rollout_capture import capture_heldout, capture_step, publish_rollout
 from avp_habitat.rollout_writer import RolloutWriter
@@ -28,6 +31,7 @@ from avp_habitat.simulators import SimulatorChoice, open_simulator
 from avp_habitat.simulators.options import add_simulator_options, simulator_choice
 from avp_habitat.tracking.addresses import TrackingError, address_of, shown
 from avp_habitat.tracking.early import open_store
+from avp_habitat.tracking.experiments import DEFAULT_HELP
 from avp_habitat.tracking.looking import about_run
 from avp_habitat.tracking.rollout_run import command_for, rollout_run
 
@@ -52,6 +56,8 @@ class Request:
     """Of the pictures that are written."""
     stochastic: bool = False
     """Sample a model's actions instead of taking the likeliest."""
+    trusted: bool = False
+    """Open a model's file also where that may run code which the file holds."""
     heldout: int = VIEWS
     """Number of held-out views."""
 
@@ -69,11 +75,13 @@ def collect(request: Request) -> dict[str, Any]:
     check_policy(request.policy)
     with RolloutWriter(request.out, request.camera) as writer:
         simulator = open_simulator(request.simulator, request.scene)
-        env, policy = make_policy_env(request.policy, simulator, request.settings, seed=request.seed)
+        env, policy = make_policy_env(
+            request.policy, simulator, request.settings, seed=request.seed, trusted=request.trusted
+        )
         total = request.settings.budget + request.heldout
-        with tqdm(total=total, unit="view", desc=f"collecting {request.out}", disable=None) as progress:
-            info = _capture_episode(request, env, policy, writer, progress)
-            capture_heldout(env, writer, request.heldout, progress=progress.update)
+        with progress(total=total, unit="view", desc=f"collecting {request.out}") as bar:
+            info = _capture_episode(request, env, policy, writer, bar)
+            capture_heldout(env, writer, request.heldout, progress=bar.update)
         return publish_rollout(
             env,
             writer,
@@ -85,23 +93,22 @@ def collect(request: Request) -> dict[str, Any]:
         )
 
 
-def _capture_episode(
-    request: Request, env: AVPEnv, policy: Policy, writer: RolloutWriter, progress: tqdm
-) -> dict[str, Any]:
+def _capture_episode(request: Request, env: AVPEnv, policy: Policy, writer: RolloutWriter, bar: tqdm) -> dict[str, Any]:
     """The `info` of the last step."""
     info: dict[str, Any] = {}
     for step in steps_of(env, policy, seed=request.seed, deterministic=not request.stochastic):
         info = step.info
         capture_step(env, writer, step.action, step.reward, info)
-        progress.update()
-    progress.total -= request.settings.budget - info["views"]
+        bar.update()
+    bar.total -= request.settings.budget - info["views"]
     return info
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m avp_habitat.collect",
-        description="Let a policy capture one episode of a scene: pictures, depth, poses, coverage, held-out views.",
+        description="Let a policy capture one episode of a scene: pictures, depth, poses, coverage, held-out views. "
+        "Takes about a minute on two CPU cores; the policies that plan (greedy, oracle, survey) take longer.",
     )
     add = parser.add_argument
     add("--scene", required=True, help=SCENES)
@@ -114,6 +121,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--width", default=640, type=int, help="of the pictures in pixels (default: %(default)s)")
     add("--height", default=480, type=int, help="of the pictures in pixels (default: %(default)s)")
     add("--stochastic", action="store_true", help="sample a model's actions instead of taking the likeliest")
+    add("--trusted", action="store_true", help=TRUSTED)
     add(
         "--mlflow",
         default="auto",
@@ -125,7 +133,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--experiment",
         metavar="NAME",
-        help="MLflow experiment of the run when that of the policy's training is not there (default: avp)",
+        help=f"MLflow experiment of the run when that of the policy's training is not there (default: {DEFAULT_HELP})",
     )
     return parser
 
@@ -146,6 +154,7 @@ def _request(options: argparse.Namespace) -> Request:
         simulator=simulator_choice(options),
         camera=Intrinsics.from_hfov(options.width, options.height, hfov_deg=settings.hfov_deg),
         stochastic=options.stochastic,
+        trusted=options.trusted,
     )
 
 
@@ -165,6 +174,9 @@ def main(argv: Sequence[str]) -> None:
     """Collect one rollout; print its figures and what to run next."""
     options = _parser().parse_args(argv)
     request = _request(options)
+    check_policy(request.policy)
+    check_writable(request.out, failure=RolloutError)
+    print(f"opening {request.scene} for {described(request.policy)} …", flush=True)
     if options.mlflow not in ("auto", "off"):
         open_store(options.mlflow)
     episode = collect(request)
@@ -176,7 +188,7 @@ def main(argv: Sequence[str]) -> None:
     print(f"look:         {out}/trajectory.png")
     track = "" if options.mlflow in ("auto", "off") else f" --mlflow {shlex.quote(shown(options.mlflow))}"
     print(f"reconstruct:  ns-train avp-nerfacto --data {out}{track}")
-    print(f"         or:  ns-train nerfacto avp-data --data {out}")
+    print(f"         or:  {nerfacto_line(out)}")
 
 
 if __name__ == "__main__":

@@ -1,14 +1,14 @@
 """Which floor cells a captured frame observes.
 
 A cell is observed once its floor point is visible in a frame: inside the image, at most 10 m away, and reached by the
-camera ray through it. `candidates` answers the first two; the third is answered by one occlusion ray per cell
-(`Simulator.visible` of the ray-casting simulator) or by a depth image (`visible_in_depth`).
+camera ray through it. `candidates` answers the first two for all cells. `Simulator.visible` answers the first and the
+third, by occlusion rays (the ray-casting simulator) or by depth images (`visible_in_depth`).
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.poses import Intrinsics, project, project_pairs
+from avp_habitat.poses import Intrinsics, in_image, project, project_pairs
 
 Float = NDArray[np.floating]
 
@@ -35,8 +35,15 @@ def candidates(
     """
     pixel, depth = project(points, camera_to_world, intrinsics)
     distance = np.linalg.norm(points[None] - camera_to_world[:, None, :3, 3], axis=-1)
-    inside = (pixel >= 0).all(axis=-1) & (pixel[..., 0] < intrinsics.width) & (pixel[..., 1] < intrinsics.height)
-    return np.argwhere(unseen & inside & (depth > 0) & (distance <= max_range_m))
+    return np.argwhere(unseen & in_image(pixel, depth, intrinsics) & (distance <= max_range_m))
+
+
+def pairs_in_image(
+    camera_to_world: Float, intrinsics: Intrinsics, points: Float, pairs: NDArray[np.integer]
+) -> NDArray[np.bool_]:
+    """`(k,)` whether points lie inside images, for `(k, 2)` rows (camera, point); other arguments as `candidates`."""
+    pixel, depth = project_pairs(points[pairs[:, 1]], camera_to_world[pairs[:, 0]], intrinsics)
+    return in_image(pixel, depth, intrinsics)
 
 
 def visible_in_depth(
@@ -48,7 +55,7 @@ def visible_in_depth(
     *,
     tolerance_m: float,
 ) -> NDArray[np.bool_]:
-    """Whether depth images show that camera rays reach points.
+    """Whether depth images show points: inside the image, and reached by the camera ray through it.
 
     The depth along the ray through a point is read between pixels: inverse depth is linear over the image of a plane,
     so bilinear interpolation of it is exact on the floor at any resolution. Where the four neighbours belong to
@@ -59,24 +66,24 @@ def visible_in_depth(
         intrinsics: of the depth images.
         depth: `(n, height, width)` planar depth in metres, 0 where nothing was hit.
         points: `(m, 3)` metres, world frame.
-        pairs: `(k, 2)` rows (camera, point), the points inside those images.
+        pairs: `(k, 2)` rows (camera, point).
         tolerance_m: a hit this close before the point still reaches it, metres along the ray.
 
     Returns:
         `(k,)`.
     """
-    camera, point = pairs[:, 0], pairs[:, 1]
-    offset = points[point] - camera_to_world[camera, :3, 3]
-    distance = np.linalg.norm(offset, axis=1)
-    pixel, planar = project_pairs(points[point], camera_to_world[camera], intrinsics)
-    u, v = pixel.T
+    pixel, planar = project_pairs(points[pairs[:, 1]], camera_to_world[pairs[:, 0]], intrinsics)
+    seen = in_image(pixel, planar, intrinsics)
+    (camera, point), (u, v), planar = pairs[seen].T, pixel[seen].T, planar[seen]
+    distance = np.linalg.norm(points[point] - camera_to_world[camera, :3, 3], axis=1)
     inverse = np.where(depth > 0, 1.0 / np.maximum(depth, 1e-6), 0.0)
     reach = planar * (1.0 - tolerance_m / np.maximum(distance, tolerance_m))
     limit = 1.0 / np.maximum(reach, 1e-6)
     between = bilinear(inverse, camera, u - 0.5, v - 0.5)
     row = np.clip(v.astype(np.int64), 0, intrinsics.height - 1)
     column = np.clip(u.astype(np.int64), 0, intrinsics.width - 1)
-    return (between <= limit) | (inverse[camera, row, column] <= limit)
+    seen[seen] = (between <= limit) | (inverse[camera, row, column] <= limit)
+    return seen
 
 
 def bilinear(images: Float, index: NDArray[np.integer], x: Float, y: Float) -> Float:

@@ -56,9 +56,9 @@ def cells_passed_over(
 @cache
 def _traverse() -> Any:
     """The compiled traversal, in units of cells: (start (2,), ends (k, 2), cell_index, out (m,))."""
-    import numba
+    from avp_habitat.compiled import njit
 
-    @numba.njit(cache=True)
+    @njit(cache=True)
     def traverse(start: Any, ends: Any, cell_index: Any, out: Any) -> None:
         rows, columns = cell_index.shape
         for k in range(len(ends)):

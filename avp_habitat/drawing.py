@@ -16,7 +16,10 @@ _LOOK = (228, 120, 51)
 _INK = (40, 40, 44)
 _CAPTION = 46
 _MARGIN = 14
-_MIN_WIDTH = 360
+_MIN_WIDTH = 440
+_LEGEND = (
+    "white dot: start    red dot: end    red: path    orange: view    blue to green: first to last seen    grey: unseen"
+)
 
 
 def draw_trajectory(area: NavigableArea, trajectory: Trajectory, *, longest_px: int = 720) -> NDArray[np.uint8]:
@@ -86,8 +89,9 @@ def _draw_caption(draw: ImageDraw.ImageDraw, trajectory: Trajectory, scale: floa
     views = len(trajectory.action)
     coverage = 100 * float(trajectory.coverage[-1]) if views else 0.0
     draw.text((_MARGIN, 6), f"{views} views, coverage {coverage:.1f} %", fill=_INK, font=font)
-    legend = "white dot: start    red: path    orange: view    blue to green: first to last seen    grey: unseen"
-    draw.text((_MARGIN, 25), legend, fill=_INK, font=ImageFont.load_default(min(11, max(8, width // 48))))
+    fonts = (ImageFont.load_default(size) for size in (11, 10, 9, 8, 7))
+    fits = next((small for small in fonts if draw.textlength(_LEGEND, small) <= width - 2 * _MARGIN), font)
+    draw.text((_MARGIN, 25), _LEGEND, fill=_INK, font=fits)
     bar = width - _MARGIN - scale
     draw.line([(bar, 18), (bar + scale, 18)], fill=_INK, width=3)
     draw.text((bar + scale / 2, 2), "1 m", fill=_INK, font=ImageFont.load_default(11), anchor="ma")

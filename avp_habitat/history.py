@@ -3,8 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from avp_habitat.compiled import njit
 
 
 class History(NamedTuple):

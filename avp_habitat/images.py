@@ -1,10 +1,15 @@
-"""Reading and writing the PNG files of a rollout, with Pillow."""
+"""Reading and writing the PNG files of a rollout."""
 
+import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+
+from avp_habitat.errors import RolloutError
+from avp_habitat.png import GREY_16, RGB_8, encode_png
 
 DEPTH_UNIT_M = 0.001
 _MAX_STORED_DEPTH = np.iinfo(np.uint16).max
@@ -17,32 +22,43 @@ def encode_depth(depth: NDArray[np.floating]) -> NDArray[np.uint16]:
 
 def write_rgb(path: Path, rgb: NDArray[np.uint8]) -> None:
     """Write `(height, width, 3)` uint8 as PNG."""
-    Image.fromarray(rgb, mode="RGB").save(path, format="PNG", compress_level=4)
+    # Runs of equal bytes only: faster than a search for longer repeats, which rendered pictures hardly have.
+    path.write_bytes(encode_png(rgb, RGB_8, level=1, strategy=zlib.Z_RLE))
 
 
 def write_depth(path: Path, depth: NDArray[np.floating]) -> None:
     """Write `(height, width)` planar depth in metres as 16-bit PNG in millimetres."""
-    Image.fromarray(encode_depth(depth)).save(path, format="PNG", compress_level=4)
+    path.write_bytes(encode_png(encode_depth(depth), GREY_16, level=1, strategy=zlib.Z_DEFAULT_STRATEGY))
 
 
 def write_numbers(path: Path, numbers: NDArray[np.uint16]) -> None:
     """Write `(height, width)` whole numbers as 16-bit grey PNG."""
-    Image.fromarray(numbers.astype(np.uint16)).save(path, format="PNG", compress_level=9)
+    path.write_bytes(encode_png(numbers, GREY_16, level=9, strategy=zlib.Z_DEFAULT_STRATEGY))
 
 
 def read_numbers(path: Path) -> NDArray[np.uint16]:
-    """Read a 16-bit grey PNG as `(height, width)` whole numbers."""
-    with Image.open(path) as image:
-        return np.asarray(image).astype(np.uint16)
+    """Read a 16-bit grey PNG as `(height, width)` whole numbers.
+
+    Raises:
+        RolloutError: the picture cannot be decoded; likewise in the other functions that read.
+    """
+    return _decoded(path).astype(np.uint16)
 
 
 def read_rgb(path: Path) -> NDArray[np.uint8]:
     """Read a PNG as `(height, width, 3)` uint8."""
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB"))
+    return _decoded(path, "RGB")
 
 
 def read_depth(path: Path) -> NDArray[np.float32]:
     """Read a depth PNG as `(height, width)` float32 metres, 0.0 where there is none."""
-    with Image.open(path) as image:
-        return np.asarray(image, dtype=np.float32) * np.float32(DEPTH_UNIT_M)
+    return _decoded(path).astype(np.float32) * np.float32(DEPTH_UNIT_M)
+
+
+def _decoded(path: Path, mode: str | None = None) -> NDArray[Any]:
+    try:
+        with Image.open(path, formats=["PNG"]) as image:
+            return np.asarray(image if mode is None else image.convert(mode))
+    except Exception as error:  # Pillow raises a dozen kinds for damaged files
+        reason = str(error) or type(error).__name__
+        raise RolloutError(f"{path}: expected a readable PNG, could not decode it: {reason}") from None

@@ -1,7 +1,8 @@
 """The compiled drawing of map observations."""
 
 import numpy as np
-from numba import njit
+
+from avp_habitat.compiled import njit
 
 OBSERVED, FRONTIER, RIM = range(3)
 

@@ -3,7 +3,40 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from avp_habitat.visibility import ALIKE_DEG, ALIKE_DISTANCE, PARALLAX_DEG
+
 Float = NDArray[np.floating]
+
+TERMS = {
+    "coverage": "share of the navigable floor that some picture shows",
+    "views": "pictures taken, one for each step",
+    "CpV": "coverage per view, mean coverage over mean number of views",
+    "EI": "efficiency index, coverage over the number of pictures",
+    "ANND": "mean distance from each camera to the nearest other one, small where places repeat",
+    "redundant views": "like an earlier one in place and direction",
+    "stop": "the policy itself ended the episode, with enough coverage",
+    "path length": "metres walked",
+    "held-out views": "pictures of the room that no reconstruction is trained on",
+    "visibility": "share of the held-out views' pixels whose surface a captured picture shows",
+    "2 frames": "that, by at least two pictures",
+    "3 frames": "that, by at least three pictures",
+    "alike": f"that, within {ALIKE_DEG:g} degrees of the held-out ray and at most {ALIKE_DISTANCE:g} times as far away",
+    "parallax": f"that, along two rays at least {PARALLAX_DEG:g} degrees apart, which fixes the depth",
+    "weighted": "that, weighted by how much the best ray is like the held-out one",
+    "PSNR": "likeness of rendered and true held-out views in dB, higher is better",
+    "SSIM": "likeness of their structure, 1 is equal",
+    "LPIPS": "difference as a network sees it, 0 is equal",
+}
+"""What the figures' names mean, in one line each: tables, pages and options say it with these words."""
+
+
+def explained(*terms: str) -> str:
+    """One line that says what terms mean.
+
+    Args:
+        *terms: of `TERMS`.
+    """
+    return "; ".join(f"{term}: {TERMS[term]}" for term in terms)
 
 
 def coverage(observed: NDArray[np.bool_], navigable: NDArray[np.bool_]) -> float:

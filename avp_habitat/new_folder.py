@@ -2,10 +2,26 @@
 
 import os
 import shutil
+import tempfile
 from pathlib import Path
 from types import TracebackType
 
 from avp_habitat.errors import AVPError, UsageError
+
+
+def check_writable(path: Path, *, failure: type[AVPError] = AVPError) -> None:
+    """Refuse a result's path before long work; what is made to find out is removed again.
+
+    Args:
+        path: of a new file or folder, as `--out` gave it.
+        failure: what is raised.
+    """
+    above = next(folder for folder in path.absolute().parents if folder.exists())
+    try:
+        with tempfile.TemporaryDirectory(prefix=".avp-", dir=above):
+            pass
+    except OSError as error:
+        raise failure(f"--out {path}: cannot write there: {above}: {error.strerror or error}") from None
 
 
 class NewFolder:

@@ -11,8 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from avp_habitat.ranges import Range, number
+
 Float = NDArray[np.floating]
 
+_SIDE, _HFOV_DEG = Range(1, 16_384), Range(1, 175)
 _FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 
@@ -39,12 +42,10 @@ class Intrinsics:
         """Square pixels with the given horizontal field of view, principal point in the middle.
 
         Raises:
-            ValueError: the field of view is not within (0, 180) degrees, or the image has no pixel.
+            UsageError: a number is outside its range.
         """
-        if not 0 < hfov_deg < 180:
-            raise ValueError(f"expected a horizontal field of view within (0, 180) degrees, got {hfov_deg}")
-        if width < 1 or height < 1:
-            raise ValueError(f"expected at least 1x1 pixels, got {width}x{height}")
+        width, height = (number(*side, int, _SIDE) for side in (("width", width), ("height", height)))
+        hfov_deg = number("hfov_deg", hfov_deg, float, _HFOV_DEG)
         focal = (width / 2) / np.tan(np.radians(hfov_deg) / 2)
         return cls(width, height, float(focal), float(focal), width / 2, height / 2)
 
@@ -163,6 +164,18 @@ def project_pairs(points: Float, pose: Float, intrinsics: Intrinsics) -> tuple[F
         `(k, 2)` pixel coordinates and `(k,)` planar depth, as `project` gives them.
     """
     return _pinhole(np.einsum("kij,ki->kj", pose[:, :3, :3], points - pose[:, :3, 3]), intrinsics)
+
+
+def in_image(pixel: Float, depth: Float, intrinsics: Intrinsics) -> NDArray[np.bool_]:
+    """Which projected points lie in front of the camera and inside its image; the right and lower borders are outside.
+
+    Args:
+        pixel: `(..., 2)` pixel coordinates, as `project` and `project_pairs` give them.
+        depth: `(...)` planar depth in metres.
+        intrinsics: of the camera.
+    """
+    u, v = pixel[..., 0], pixel[..., 1]
+    return (depth > 0) & (u >= 0) & (u < intrinsics.width) & (v >= 0) & (v < intrinsics.height)
 
 
 def _pinhole(local: Float, intrinsics: Intrinsics) -> tuple[Float, Float]:

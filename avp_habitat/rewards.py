@@ -1,57 +1,61 @@
-"""The four rewards of the task as sums of named parts, for n agents at a time."""
+"""The rewards of the task as sums of named parts, for n agents at a time."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.errors import unknown_name
+from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.ranges import Range, hold_ranges
 
 Float = NDArray[np.floating]
 Number = NDArray[np.number]
 Bool = NDArray[np.bool_]
-
-PARTS = ("coverage", "surface", "spread", "step", "collision", "redundancy", "stop")
-"""Names of the parts; every reward returns all of them, zero where it has no such term."""
+Amount = Annotated[float, Range(0, 1000)]
 
 
 @dataclass(frozen=True)
 class RewardConstants:
     """The constants of all rewards; the paper gives none, so these are ours and the same for every scene."""
 
-    alpha: float = 0.004
+    alpha: Amount = 0.004
     """α of `coverage` and `coverage_redundancy`: reward per newly observed cell (0.01 m²)."""
-    alpha_proposed: float = 0.0088
+    alpha_proposed: Amount = 0.0088
     """α of `proposed`: reward per (newly observed cell)^β."""
-    alpha_surface: float = 0.0045
+    alpha_surface: Amount = 0.0045
     """α of `surface`: reward per (newly seen surface point)^β, each weighted by how well it is seen (`surfaces`)."""
-    beta: float = 0.9
+    beta: Annotated[float, Range(0, 1)] = 0.9
     """β of `proposed` and `surface`, no unit, below 1: much that is new at once counts less than step after step."""
-    visit_decay: float = 0.5
+    visit_decay: Amount = 0.5
     """Weight of earlier visits v in α / (1 + 0.5·v), per visit."""
-    spread: float = 0.002
+    spread: Amount = 0.002
     """λ_s: reward per metre between the agent and the mean of the positions it visited."""
-    spread_limit_m: float = 3.0
+    spread_limit_m: Amount = 3.0
     """r_max in metres: more distance than this earns nothing more."""
-    step: float = 0.045
+    step: Amount = 0.045
     """P_step: cost of each step."""
-    collision: float = 0.05
+    collision: Amount = 0.05
     """P_collision: cost of a forward move that was blocked."""
-    redundancy: float = 0.03
+    redundancy: Amount = 0.03
     """P_redundancy: cost of a view like an earlier one."""
-    redundancy_distance_m: float = 0.2
+    redundancy_distance_m: Amount = 0.2
     """d_red in metres: below one forward move, so that walking on is never redundant."""
-    redundancy_angle_deg: float = 5.0
+    redundancy_angle_deg: Annotated[float, Range(0, 180)] = 5.0
     """δ in degrees, for yaw and pitch alike: below one turn, so that turning on is never redundant."""
-    stop_bonus: float = 1.0
+    stop_bonus: Amount = 1.0
     """B_s: reward of stopping with enough coverage."""
-    stop_per_step_left: float = 0.01
+    stop_per_step_left: Amount = 0.01
     """λ_e: further reward per step of the budget that was not used."""
-    early_stop: float = 0.02
+    early_stop: Amount = 0.02
     """Cost of choosing stop with too little coverage."""
-    stop_coverage: float = 0.85
+    stop_coverage: Annotated[float, Range(0, 1)] = 0.85
     """τ: the coverage from which stop ends the episode, within [0, 1]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is outside its range."""
+        hold_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -85,21 +89,25 @@ def _coverage(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]
 
 def _coverage_redundancy(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """Eq. 25: α·Δc + λ_s·min(‖p − p̄‖, r_max) − P_redundancy − P_collision."""
-    return _coverage(facts, constants) | _dispersion(facts, constants)
+    return {
+        "coverage": constants.alpha * facts.new_cells,
+        "spread": _spread(facts, constants),
+        "collision": -constants.collision * facts.collided,
+        "redundancy": -constants.redundancy * facts.redundant,
+    }
 
 
 def _proposed(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """Eq. 19–22: sublinear, visit-discounted coverage with dispersion, step cost and a learned stop."""
-    return _with_ends(facts, constants) | {
-        "coverage": _new(facts.new_cells, constants.alpha_proposed, facts, constants)
-    }
+    new = {"coverage": _new(facts.new_cells, constants.alpha_proposed, facts, constants)}
+    return new | _with_ends(facts, constants)
 
 
 def _surface(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """`proposed` with new surface ΔS in place of new cells Δc."""
-    return _with_ends(facts, constants) | {
-        "surface": _new(facts.new_surface, constants.alpha_surface, facts, constants)
-    }
+    return {"surface": _new(facts.new_surface, constants.alpha_surface, facts, constants)} | _with_ends(
+        facts, constants
+    )
 
 
 def _new(amount: Number, alpha: float, facts: StepFacts, constants: RewardConstants) -> Number:
@@ -111,27 +119,28 @@ def _with_ends(facts: StepFacts, constants: RewardConstants) -> dict[str, Number
     """What `proposed` and `surface` share: dispersion, costs and the stop."""
     success = constants.stop_bonus + constants.stop_per_step_left * facts.steps_left
     stop = np.where(stops_episode(facts, constants), success, -constants.early_stop)
-    return _dispersion(facts, constants) | {
+    return {
+        "spread": _spread(facts, constants),
         "step": np.full(len(facts.coverage), -constants.step),
         "collision": -constants.collision * facts.collided,
+        "redundancy": -constants.redundancy * facts.redundant,
         "stop": np.where(facts.stop_chosen, stop, 0.0),
     }
 
 
-def _dispersion(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
-    return {
-        "spread": constants.spread * np.minimum(facts.spread_m, constants.spread_limit_m),
-        "redundancy": -constants.redundancy * facts.redundant,
-    }
+def _spread(facts: StepFacts, constants: RewardConstants) -> Number:
+    return constants.spread * np.minimum(facts.spread_m, constants.spread_limit_m)
 
 
-_REWARDS: dict[str, Callable[[StepFacts, RewardConstants], dict[str, Number]]] = {
+REWARDS: dict[str, Callable[[StepFacts, RewardConstants], Mapping[str, Number | float]]] = {
     "coverage": _coverage,
     "coverage_redundancy": _coverage_redundancy,
     "proposed": _proposed,
     "surface": _surface,
 }
-REWARD_NAMES = tuple(_REWARDS)
+"""By name: what gives a step's parts, each one number per agent or one for all; their sum is the reward. The parts
+may have any names, and a step may leave some out. A further entry is a further reward."""
+REWARD_NAMES = tuple(REWARDS)
 _WITH_STOP = frozenset({"proposed", "surface"})
 
 
@@ -141,7 +150,7 @@ def check_reward(name: str) -> str:
     Raises:
         UsageError: it is not; the text names the nearest one.
     """
-    if name not in _REWARDS:
+    if name not in REWARDS:
         raise unknown_name("reward", name, REWARD_NAMES)
     return name
 
@@ -157,7 +166,7 @@ def stops_episode(facts: StepFacts, constants: RewardConstants) -> Bool:
 
 
 def reward_parts(name: str, facts: StepFacts, constants: RewardConstants) -> dict[str, NDArray[np.float64]]:
-    """The parts of a reward, `(n,)` each, in the order of `PARTS`; the reward is their sum.
+    """The parts of a reward, `(n,)` each, as its function names them; the reward is their sum.
 
     Args:
         name: one of `REWARD_NAMES`.
@@ -165,8 +174,14 @@ def reward_parts(name: str, facts: StepFacts, constants: RewardConstants) -> dic
         constants: of all rewards.
 
     Raises:
-        UsageError: no such reward.
+        UsageError: no such reward, or a part is neither one number for each agent nor one for all of them.
     """
-    parts = _REWARDS[check_reward(name)](facts, constants)
-    zero = np.zeros(len(facts.coverage))
-    return {part: np.asarray(parts.get(part, zero), dtype=np.float64) for part in PARTS}
+    parts = REWARDS[check_reward(name)](facts, constants)
+    return {part: _for_each(len(facts.coverage), value, f"{name}: part {part!r}") for part, value in parts.items()}
+
+
+def _for_each(agents: int, value: Number | float, what: str) -> NDArray[np.float64]:
+    numbers = np.asarray(value, dtype=np.float64)
+    if numbers.shape not in ((), (agents,)):
+        raise UsageError(f"reward {what}: expected one number for each of {agents} agents, got shape {numbers.shape}")
+    return np.full(agents, numbers) if numbers.ndim == 0 else numbers

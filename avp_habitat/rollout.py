@@ -6,6 +6,8 @@ Nothing is decoded here: pictures are checked by their first and last bytes, so 
 
 import json
 import os
+import reprlib
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +33,10 @@ _CLEARLY_RIGID = 5e-5
 _LONGEST_POSE_BYTES = 4096
 # Beyond any size in pixels or metres.
 _BEYOND_ANY_SIZE = 1e9
+# A rollout.json is nested 3 deep; what walks it recursively can bear this much.
+_DEEPEST = 16
+_NAMED = ("scene", "simulator", "policy")
+_OBJECTS = ("metrics", "versions", "actions")
 
 
 @dataclass(frozen=True)
@@ -105,10 +111,10 @@ def read_rollout(folder: str | Path) -> Rollout:
 
 
 def read_meta(folder: Path) -> dict[str, Any]:
-    """`rollout.json` of a folder, its format and version checked.
+    """`rollout.json` of a folder, everything in it that the suite uses held to its type and range.
 
     Raises:
-        RolloutError: it is missing, not JSON, not a rollout, or of another version.
+        RolloutError: it is missing, not JSON, not a rollout, of another version, or has an entry of another kind.
     """
     path = folder / "rollout.json"
     meta = read_json(path)
@@ -120,14 +126,25 @@ def read_meta(folder: Path) -> dict[str, Any]:
             f"{path}: expected format version {FORMAT_VERSION}, found {meta.get('format_version')!r}, written by "
             f"avp-suite {writer}; collect it again or read it with that version"
         )
+    _check_facts(path, meta)
+    _intrinsics(path, meta)
+    for key in ("frames", HELDOUT):
+        _count(folder, meta, key)
     return meta
 
 
+def name_of(meta: dict[str, Any], key: str) -> str:
+    """The name of a rollout's `scene`, `simulator` or `policy`; empty where there is none."""
+    value = meta.get(key)
+    return value if isinstance(value, str) else _of(meta, key).get("name") or ""
+
+
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON file whose top is an object.
+    """A JSON file whose top is an object, all of it such that it can be computed with and written again.
 
     Raises:
-        RolloutError: it is missing, unreadable, or not a JSON object.
+        RolloutError: it is missing, unreadable, not a JSON object, nested without end, or holds a number that is not
+            finite or text that is not Unicode.
     """
     _check_inside(path.parent, path)
     try:
@@ -138,7 +155,32 @@ def read_json(path: Path) -> dict[str, Any]:
         raise RolloutError(f"{path}: expected JSON, could not read it: {error}") from None
     if not isinstance(value, dict):
         raise RolloutError(f"{path}: expected a JSON object, found a {type(value).__name__}")
+    _check_values(path, value, "", 0)
     return value
+
+
+def _check_values(path: Path, value: Any, name: str, depth: int) -> None:
+    """Python reads NaN, infinity, numbers beyond any float and halves of characters, which nothing else can bear."""
+    if depth > _DEEPEST:
+        raise RolloutError(f"{path}: expected at most {_DEEPEST} levels, {reprlib.repr(name)} is nested deeper")
+    if isinstance(value, str):
+        _check_text(path, value, name)
+    elif isinstance(value, dict):
+        for key, entry in value.items():
+            _check_text(path, key, f"a name in {name or 'the file'}")
+            _check_values(path, entry, f"{name}.{key}".lstrip("."), depth + 1)
+    elif isinstance(value, list):
+        for index, entry in enumerate(value):
+            _check_values(path, entry, f"{name}[{index}]", depth + 1)
+    elif isinstance(value, int | float) and not abs(value) <= sys.float_info.max:
+        raise RolloutError(f"{path}: expected {name} to be a finite number, found {reprlib.repr(value)}")
+
+
+def _check_text(path: Path, text: str, name: str) -> None:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise RolloutError(f"{path}: expected {name} to be Unicode text, found {text[:20]!a}") from None
 
 
 def read_pose(path: Path) -> NDArray[np.float64]:
@@ -173,6 +215,8 @@ def _pose_numbers(path: str) -> list[float]:
         raise RolloutError(f"{path}: expected 4 rows of 4 numbers, could not read them: {error}") from None
     if len(numbers) != 16:
         raise RolloutError(f"{path}: expected 4 rows of 4 numbers, found {len(numbers)} numbers")
+    if beyond := [number for number in numbers if abs(number) >= _BEYOND_ANY_SIZE]:
+        raise RolloutError(f"{path}: expected metres, found {beyond[0]:g}")
     return numbers
 
 
@@ -187,6 +231,22 @@ def _clearly_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     return finite & turned & (np.maximum(skew, last_row) < _CLEARLY_RIGID)
 
 
+def _check_facts(path: Path, meta: dict[str, Any]) -> None:
+    """Hold what is shown, logged and computed with to its kind; what is left out is left out."""
+    for key in _NAMED:
+        value = meta.get(key)
+        name = value.get("name") if isinstance(value, dict) else value
+        if not isinstance(name, str | None):
+            raise RolloutError(f"{path}: expected the name of the {key} to be text, found {reprlib.repr(name)}")
+    for key in _OBJECTS:
+        if not isinstance(meta.get(key, {}), dict):
+            raise RolloutError(f"{path}: expected {key} to be an object, found {reprlib.repr(meta[key])}")
+    for key in ("metrics", "actions"):
+        for name, value in meta.get(key, {}).items():
+            if name != "names" and (isinstance(value, bool) or not isinstance(value, int | float)):
+                raise RolloutError(f"{path}: expected {key}.{name} to be a finite number, found {reprlib.repr(value)}")
+
+
 def _of(meta: dict[str, Any], key: str) -> dict[str, Any]:
     value = meta.get(key)
     return value if isinstance(value, dict) else {}
@@ -195,7 +255,9 @@ def _of(meta: dict[str, Any], key: str) -> dict[str, Any]:
 def _count(folder: Path, meta: dict[str, Any], key: str) -> int:
     count = _of(meta, "counts").get(key)
     if not isinstance(count, int) or isinstance(count, bool) or count < 0:
-        raise RolloutError(f"{folder / 'rollout.json'}: expected counts.{key} to be a whole number, found {count!r}")
+        raise RolloutError(
+            f"{folder / 'rollout.json'}: expected counts.{key} to be a whole number, found {reprlib.repr(count)}"
+        )
     return count
 
 
@@ -206,7 +268,7 @@ def _intrinsics(path: Path, meta: dict[str, Any]) -> Intrinsics:
         value = camera.get(name)
         if not _is_number_of_pixels(value) or (kind is int and value % 1):
             expected = "a whole number of pixels" if kind is int else "a number of pixels"
-            raise RolloutError(f"{path}: expected camera.{name} to be {expected} above 0, found {value!r}")
+            raise RolloutError(f"{path}: expected camera.{name} to be {expected} above 0, found {reprlib.repr(value)}")
         values[name] = kind(value)
     return Intrinsics(**values)
 
@@ -259,7 +321,7 @@ def _is_finite(value: Any) -> TypeGuard[float]:
 
 
 def _check_listing(root: Path, folder: Path, suffix: str, count: int) -> None:
-    """Hold a folder to exactly the files of `count` frames, none of them leading out of the rollout."""
+    """Hold a folder to exactly the files of `count` frames; links may lead anywhere, as into a store of DVC."""
     _check_inside(root, folder)
     try:
         with os.scandir(folder) as entries:
@@ -283,9 +345,12 @@ def _check_listing(root: Path, folder: Path, suffix: str, count: int) -> None:
 
 
 def _check_inside(root: Path, path: Path) -> None:
+    """Refuse a path that leaves the rollout as it is written, and a link that leads to itself."""
+    if not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(root)):
+        raise RolloutError(f"{path}: expected a path inside {root}")
     try:
-        leads_to = path.resolve()
+        path.resolve(strict=path.is_symlink())
+    except FileNotFoundError:
+        raise RolloutError(f"{path}: expected a file, found a link to {os.readlink(path)}, which is missing") from None
     except (OSError, RuntimeError):
-        raise RolloutError(f"{path}: expected a path inside {root}, found a link that leads to itself") from None
-    if not leads_to.is_relative_to(root.resolve()):
-        raise RolloutError(f"{path}: expected a path inside {root}, it leads to {leads_to}")
+        raise RolloutError(f"{path}: expected a file, found a link that leads to itself") from None

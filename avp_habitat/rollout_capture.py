@@ -19,7 +19,6 @@ from avp_habitat.trajectory import Trajectory
 from avp_habitat.versions import installed_versions
 
 _VERSIONED = ("avp-suite", "numpy", "gymnasium", "open3d", "pillow", "stable-baselines3", "torch")
-_HELDOUT_BATCH = 4
 _FLOOR_FILE = "floor.png"
 
 
@@ -54,12 +53,11 @@ def capture_heldout(
     if not views:
         return
     poses = heldout_poses(env.simulator, sensor_height_m=env.settings.sensor_height_m, views=views)
-    for batch in np.array_split(poses, -(-len(poses) // _HELDOUT_BATCH)):
-        frames = env.capture(batch, writer.intrinsics)
+    for pose in poses:
+        frames = env.capture(pose[None], writer.intrinsics)
         assert frames.rgb is not None
-        for rgb, depth, pose in zip(frames.rgb, frames.depth, batch, strict=True):
-            writer.add_heldout(rgb, depth, pose)
-            progress()
+        writer.add_heldout(frames.rgb[0], frames.depth[0], pose)
+        progress()
 
 
 def publish_rollout(

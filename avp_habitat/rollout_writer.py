@@ -2,7 +2,9 @@
 
 import csv
 import json
+from collections import deque
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -16,10 +18,16 @@ from avp_habitat.new_folder import NewFolder
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout import FORMAT, FORMAT_VERSION, HELDOUT, POSE_CONVENTION, View, frame_name
 
+_THREADS = 4
+_AHEAD = 8
+"""At most so many pictures wait to be encoded and written, which bounds the memory."""
+
 
 class RolloutWriter:
     """A context in which frames are written to a temporary folder, renamed to its final name by `publish`.
 
+    Views are encoded in threads while the next are rendered: their arrays must not change once they were added, and a
+    disk that fails is reported by one of the next calls, by `publish` at the latest.
     Leaving the context without `publish` (an error, Ctrl-C) removes the temporary folder.
     """
 
@@ -39,6 +47,8 @@ class RolloutWriter:
         self.folder = self._new.folder
         self._poses: dict[str, list[NDArray[np.float64]]] = {"": [], HELDOUT: []}
         self._steps: list[dict[str, Any]] = []
+        self._threads = ThreadPoolExecutor(_THREADS)
+        self._pending: deque[Future[None]] = deque()
 
     def __enter__(self) -> "RolloutWriter":
         """Make the temporary folder."""
@@ -55,6 +65,7 @@ class RolloutWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Remove what was not published; report a full or failing disk as such."""
+        self._threads.shutdown(cancel_futures=True)
         self._new.__exit__(kind, error, trace)
 
     def add_frame(self, rgb: NDArray[np.uint8], depth: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
@@ -66,11 +77,12 @@ class RolloutWriter:
         self._add(HELDOUT, rgb, depth, pose)
 
     def add_step(self, row: Mapping[str, Any]) -> None:
-        """Remember the next row of `steps.csv`; all rows have the same keys."""
+        """Remember the next row of `steps.csv`; a key that only some rows have is 0 in the others."""
         self._steps.append(dict(row))
 
     def views(self, *, heldout: bool) -> list[View]:
-        """The captured frames, or the held-out views, that were written so far."""
+        """The captured frames, or the held-out views, so far; all of them are written."""
+        self._finish(waiting=0)
         base = HELDOUT if heldout else ""
         images, depths = self.path(base) / "images", self.path(base) / "depth"
         names = [f"{frame_name(index)}.png" for index in range(len(self._poses[base]))]
@@ -89,18 +101,25 @@ class RolloutWriter:
         Raises:
             UsageError: a folder of that name has appeared meanwhile.
         """
+        self._finish(waiting=0)
         self._write_steps()
         self._write_json("transforms.json", self._transforms())
         self._write_json("rollout.json", self._rollout(meta))
         return self._new.publish()
 
     def _add(self, base: str, rgb: NDArray[np.uint8], depth: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
-        stem = frame_name(len(self._poses[base]))
-        images.write_rgb(self.path(base) / "images" / f"{stem}.png", rgb)
-        images.write_depth(self.path(base) / "depth" / f"{stem}.png", depth)
+        folder, stem = self.path(base), frame_name(len(self._poses[base]))
         rows = "\n".join(" ".join(f"{value:.9f}" for value in row) for row in pose)
-        (self.path(base) / "poses" / f"{stem}.txt").write_text(rows + "\n", encoding="ascii")
+        (folder / "poses" / f"{stem}.txt").write_text(rows + "\n", encoding="ascii")
         self._poses[base].append(np.asarray(pose, dtype=np.float64))
+        self._pending.append(self._threads.submit(images.write_rgb, folder / "images" / f"{stem}.png", rgb))
+        self._pending.append(self._threads.submit(images.write_depth, folder / "depth" / f"{stem}.png", depth))
+        self._finish(waiting=_AHEAD)
+
+    def _finish(self, *, waiting: int) -> None:
+        """Wait until at most so many pictures are still to be written; raises what went wrong with the others."""
+        while len(self._pending) > waiting:
+            self._pending.popleft().result()
 
     def _rollout(self, meta: Mapping[str, Any]) -> dict[str, Any]:
         camera = {
@@ -153,7 +172,8 @@ class RolloutWriter:
 
     def _write_steps(self) -> None:
         with self.path("steps.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, fieldnames=list(self._steps[0]) if self._steps else [])
+            names = dict.fromkeys(name for row in self._steps for name in row)
+            writer = csv.DictWriter(file, fieldnames=list(names), restval=0)
             writer.writeheader()
             writer.writerows(self._steps)
 

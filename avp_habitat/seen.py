@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from avp_habitat import command
 from avp_habitat.errors import RolloutError, UsageError
-from avp_habitat.rollout import read_rollout
+from avp_habitat.metrics import TERMS, explained
+from avp_habitat.progress import progress
+from avp_habitat.rollout import name_of, read_rollout
 from avp_habitat.rollout_visibility import visibility_of
-from avp_habitat.visibility import ALIKE_DEG, ALIKE_DISTANCE, PARALLAX_DEG, Visibility
+from avp_habitat.visibility import Visibility
 
 _COLUMNS = {
     "rollout": "rollout",
@@ -30,11 +30,7 @@ _COLUMNS = {
     "visibility_weighted": "weighted",
 }
 _WORDS = 3
-_MEANING = (
-    "visibility: share of the held-out pixels whose surface a captured frame has seen, in percent; 2 frames, 3 frames: "
-    f"by so many; alike: within {ALIKE_DEG:g} degrees of the held-out ray and at most {ALIKE_DISTANCE:g} times as far; "
-    f"parallax: along two rays {PARALLAX_DEG:g} degrees apart; weighted: by the best ray's likeness to the held-out one"
-)
+_MEANING = "In percent. " + explained(*(name for name in _COLUMNS.values() if name in TERMS and name != "views"))
 
 
 @dataclass(frozen=True)
@@ -73,22 +69,19 @@ def report_on(folder: Path, *, stride: int | None = None) -> Report:
         RolloutError: the rollout is damaged, or no held-out view shows a surface.
     """
     rollout = read_rollout(folder)
-    scene, policy, metrics = (
-        part if isinstance(part, dict) else {} for part in map(rollout.meta.get, ("scene", "policy", "metrics"))
-    )
     found = visibility_of(rollout.frames, rollout.heldout, rollout.intrinsics, stride=stride)
     if not len(found.view):
         raise RolloutError(
             f"{folder}: expected held-out views that show a surface, found {len(rollout.heldout)} held-out views "
             "without any depth; collect it with held-out views"
         )
-    coverage = metrics.get("coverage")
+    coverage = rollout.meta.get("metrics", {}).get("coverage")
     about = {
         "rollout": str(folder),
-        "scene": scene.get("name", ""),
-        "policy": policy.get("name", ""),
+        "scene": name_of(rollout.meta, "scene"),
+        "policy": name_of(rollout.meta, "policy"),
         "views": len(rollout.frames),
-        "coverage": float(coverage) if isinstance(coverage, int | float) else None,
+        "coverage": None if coverage is None else float(coverage),
     }
     return Report(about, found)
 
@@ -97,7 +90,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m avp_habitat.seen",
         description="How much of what the held-out views show the captured frames have seen: from depth alone, a "
-        "predictor of the reconstruction's quality.",
+        "predictor of the reconstruction's quality. Takes some seconds for each rollout.",
         epilog=_MEANING,
     )
     add = parser.add_argument
@@ -128,9 +121,8 @@ def main(argv: Sequence[str]) -> None:
     options = _parser().parse_args(argv)
     if options.every is not None and options.every < 1:
         raise UsageError(f"--every: expected a whole number from 1, got {options.every}")
-    waiting = tqdm(
-        options.rollouts, desc="rollouts", unit="rollout", disable=True if len(options.rollouts) < 2 else None
-    )
+    several = len(options.rollouts) > 1
+    waiting = progress(options.rollouts, desc="reading", unit="rollout") if several else options.rollouts
     reports = [report_on(folder, stride=options.every) for folder in waiting]
     if options.json:
         print(json.dumps([report.as_json() for report in reports], indent=2, allow_nan=False))

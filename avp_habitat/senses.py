@@ -114,7 +114,7 @@ class CastSenses:
         settings, centres = self._settings, self._simulator.area.centres
         pose = views.camera_to_world
         pairs = candidates(pose, self._intrinsics, centres, unseen, max_range_m=settings.max_range_m)
-        reached = self._simulator.visible(pose, centres, pairs, tolerance_m=settings.tolerance_m)
+        reached = self._simulator.visible(pose, self._intrinsics, centres, pairs, tolerance_m=settings.tolerance_m)
         return pairs[reached, 0], pairs[reached, 1]
 
     def _new_over(self, views: Views, depth: Float, unseen: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:

@@ -1,10 +1,11 @@
 """The settings of the task, with the design's defaults."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
-from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics
+from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rewards import RewardConstants, check_reward
 
 ACTION_NAMES = ("move_forward", "turn_left", "turn_right", "look_up", "look_down", "stop")
@@ -21,29 +22,29 @@ class TaskSettings:
     """Name of the reward: coverage, coverage_redundancy, proposed or surface."""
     constants: RewardConstants = field(default_factory=RewardConstants)
     """The rewards' constants."""
-    budget: int = 80
+    budget: Annotated[int, Range(1, 100000)] = 80
     """T: steps, which are views, per episode."""
-    forward_m: float = 0.25
+    forward_m: Annotated[float, Range(0.01, 10)] = 0.25
     """Length of a forward move in metres."""
-    turn_deg: float = 10.0
+    turn_deg: Annotated[float, Range(0.1, 180)] = 10.0
     """Yaw of one turn in degrees."""
-    tilt_deg: float = 10.0
+    tilt_deg: Annotated[float, Range(0.1, 90)] = 10.0
     """Pitch of one look up or down in degrees."""
-    pitch_limit_deg: float = 60.0
+    pitch_limit_deg: Annotated[float, Range(0, 89)] = 60.0
     """Greatest pitch, up and down, in degrees."""
-    collision_m: float = 0.05
+    collision_m: Annotated[float, Range(0, 10)] = 0.05
     """A forward move shorter than this, in metres, is a collision."""
-    sensor_height_m: float = 1.5
+    sensor_height_m: Annotated[float, Range(0.01, 10)] = 1.5
     """Height of the camera above the floor under the agent, metres."""
-    hfov_deg: float = 90.0
+    hfov_deg: Annotated[float, Range(1, 175)] = 90.0
     """Horizontal field of view in degrees."""
-    width: int = 160
+    width: Annotated[int, Range(1, 4096)] = 160
     """Width of the policy's depth image in pixels."""
-    height: int = 120
+    height: Annotated[int, Range(1, 4096)] = 120
     """Height of the policy's depth image in pixels."""
-    max_range_m: float = 10.0
+    max_range_m: Annotated[float, Range(0.1, 1000)] = 10.0
     """Cells farther than this from the camera are not observed; also the unit of the depth observations, metres."""
-    tolerance_m: float = 0.1
+    tolerance_m: Annotated[float, Range(0, 1)] = 0.1
     """A hit this close before a floor point still observes it, metres along the ray."""
     coverage_mode: Literal["visible", "over"] = "visible"
     """visible: a cell's floor point is seen. over: a camera ray passes over the cell."""
@@ -56,27 +57,12 @@ class TaskSettings:
     def __post_init__(self) -> None:
         """Refuse what cannot work, by the option's name."""
         check_reward(self.reward)
-        if self.coverage_mode not in COVERAGE_MODES:
-            raise unknown_name("coverage_mode", self.coverage_mode, COVERAGE_MODES)
-        if self.observation not in OBSERVATION_NAMES:
-            raise unknown_name("observation", self.observation, OBSERVATION_NAMES)
-        for name in (
-            "budget",
-            "width",
-            "height",
-            "forward_m",
-            "turn_deg",
-            "tilt_deg",
-            "sensor_height_m",
-            "max_range_m",
-        ):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
-                raise UsageError(f"{name}: expected a number above 0, got {value!r}")
-        if not 0 < self.hfov_deg < 180:
-            raise UsageError(f"hfov_deg: expected degrees within (0, 180), got {self.hfov_deg!r}")
-        if not 0 <= self.pitch_limit_deg < 90:
-            raise UsageError(f"pitch_limit_deg: expected degrees within [0, 90), got {self.pitch_limit_deg!r}")
+        hold_ranges(self)
+        if self.collision_m >= self.forward_m:
+            raise UsageError(
+                f"collision_m: expected less than forward_m ({self.forward_m:g}), or every move is a collision, got "
+                f"{self.collision_m:g}"
+            )
 
     @property
     def with_surface(self) -> bool:

@@ -44,10 +44,9 @@ class CastSurface:
         eye = views.camera_to_world[:, None, :3, 3]
         found = view_quality(eye, surface.points[None], surface.normals[None]).astype(np.float32)
         better, reach = found > quality[rows], settings.max_range_m
-        pairs = candidates(views.camera_to_world, settings.intrinsics, surface.points, better, max_range_m=reach)
-        reached = self._simulator.visible(
-            views.camera_to_world, surface.points, pairs, tolerance_m=settings.tolerance_m
-        )
+        pose, camera = views.camera_to_world, settings.intrinsics
+        pairs = candidates(pose, camera, surface.points, better, max_range_m=reach)
+        reached = self._simulator.visible(pose, camera, surface.points, pairs, tolerance_m=settings.tolerance_m)
         agent, point = pairs[reached].T
         return raise_quality(quality, rows, agent, point, found[agent, point])
 

@@ -15,7 +15,7 @@ from avp_habitat.agent_view import AgentView
 from avp_habitat.map_observation import SIZE as MAP_SIZE
 from avp_habitat.map_observation import MapObserver
 from avp_habitat.observation import observation
-from avp_habitat.rewards import PARTS, StepFacts, has_stop, reward_parts, stops_episode
+from avp_habitat.rewards import StepFacts, has_stop, reward_parts, stops_episode
 from avp_habitat.senses import Perception, Senses, Views, make_senses
 from avp_habitat.settings import MOVE_FORWARD, STOP, TaskSettings
 from avp_habitat.simulators.base import Simulator
@@ -25,7 +25,6 @@ from avp_habitat.trajectory import Trajectory
 
 Float = NDArray[np.floating]
 Rows = NDArray[np.int64]
-_PART_COLUMNS = tuple(f"part {name}" for name in PARTS)
 
 
 @dataclass(frozen=True)
@@ -105,9 +104,10 @@ class ViewpointTask:
         self._angles = np.zeros((agents, budget + 1, 2))
         self._cell = np.zeros((agents, budget + 1, 2), dtype=np.int64)
         self._log = {
-            name: np.zeros((agents, budget))
-            for name in ("action", "reward", "coverage", "collided", "redundant", *_PART_COLUMNS)
+            name: np.zeros((agents, budget)) for name in ("action", "reward", "coverage", "collided", "redundant")
         }
+        # By the names that the reward gives them, from the first step that has them; zero in all others.
+        self._parts: dict[str, NDArray[np.float64]] = {}
 
     def simulator(self, row: int) -> Simulator:
         """The simulator of one agent's scene."""
@@ -177,7 +177,7 @@ class ViewpointTask:
         self._observed += seen.new_cells
         facts = self._facts(actions, seen.new_cells, self._capture_surface())
         parts = reward_parts(self.settings.reward, facts, self.settings.constants)
-        reward = np.sum([parts[name] for name in PARTS], axis=0)
+        reward = np.sum(list(parts.values()), axis=0) + np.zeros(self.agents)
         terminated = stops_episode(facts, self.settings.constants)
         self._record(actions, reward, parts, facts)
         return StepOutcome(
@@ -192,7 +192,10 @@ class ViewpointTask:
     def trajectory(self, row: int) -> Trajectory:
         """Copies of what one agent did so far in its episode."""
         steps = int(self.steps[row])
-        log = {name: values[row, :steps].copy() for name, values in self._log.items()}
+        log, parts = (
+            {name: values[row, :steps].copy() for name, values in columns.items()}
+            for columns in (self._log, self._parts)
+        )
         position = self._path[row, 1 : steps + 1].copy()
         yaw, pitch = self._angles[row, 1 : steps + 1].T.copy()
         return Trajectory(
@@ -203,7 +206,7 @@ class ViewpointTask:
             camera_to_world=motion.sensor_poses(self.settings, position, yaw, pitch),
             action=log["action"].astype(np.int64),
             reward=log["reward"],
-            reward_parts={name: log[f"part {name}"] for name in PARTS},
+            reward_parts=parts,
             coverage=log["coverage"],
             collided=log["collided"].astype(np.bool_),
             redundant=log["redundant"].astype(np.bool_),
@@ -335,13 +338,18 @@ class ViewpointTask:
     def _record(
         self, actions: NDArray[np.integer], reward: Float, parts: dict[str, NDArray[np.float64]], facts: StepFacts
     ) -> None:
+        now = (self._everyone, self.steps - 1)
         columns = {
             "action": actions,
             "reward": reward,
             "coverage": facts.coverage,
             "collided": facts.collided,
             "redundant": facts.redundant,
-            **{f"part {name}": values for name, values in parts.items()},
         }
         for name, values in columns.items():
-            self._log[name][self._everyone, self.steps - 1] = values
+            self._log[name][now] = values
+        for name in parts:
+            if name not in self._parts:
+                self._parts[name] = np.zeros((self.agents, self.settings.budget))
+        for name, column in self._parts.items():
+            column[now] = parts.get(name, 0.0)

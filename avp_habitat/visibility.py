@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.coverage import bilinear
-from avp_habitat.poses import Intrinsics, pixel_directions, project
+from avp_habitat.poses import Intrinsics, in_image, pixel_directions, project
 
 Float = NDArray[np.floating]
 DepthView = tuple[Float, Float]
@@ -166,8 +166,7 @@ def points_seen(depth: Float, camera_to_world: Float, intrinsics: Intrinsics, po
 def _seen(inverse: Float, camera_to_world: Float, intrinsics: Intrinsics, points: Float) -> NDArray[np.int64]:
     pixel, depth = project(points, camera_to_world[None], intrinsics)
     (u, v), planar = pixel[0].T, depth[0]
-    inside = (planar > 0) & (u >= 0) & (u < intrinsics.width) & (v >= 0) & (v < intrinsics.height)
-    index = np.flatnonzero(inside)
+    index = np.flatnonzero(in_image(pixel[0], planar, intrinsics))
     u, v, planar = u[index], v[index], planar[index]
     # |d - z| <= t in inverse depth; 1/d is at most 1/(z - t), unbounded where the camera is that near.
     tolerance = np.maximum(TOLERANCE_M, TOLERANCE_SHARE * planar)

@@ -14,11 +14,13 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from nerfstudio.data.scene_box import SceneBox
 from numpy.typing import NDArray
 
-from avp_habitat.errors import RolloutError
+from avp_habitat.errors import AVPError, RolloutError
 from avp_habitat.images import DEPTH_UNIT_M
 from avp_habitat.poses import Intrinsics, y_up_to_z_up
-from avp_habitat.rollout import Rollout, View
+from avp_habitat.rollout import Rollout, View, name_of
+from avp_nerfstudio.foreign import check_is_rollout
 from avp_nerfstudio.merging import read_merged
+from avp_nerfstudio.running import check_device, check_is_there, discard_outputs
 from avp_nerfstudio.seen_points import SeenPoints, scene_box, seen_points, subset
 from avp_nerfstudio.selection import Order, chosen_views
 from avp_nerfstudio.verification import verify_pictures
@@ -74,8 +76,9 @@ class AVPDataParserConfig(DataParserConfig):
     each side; a rollout says how large the navigable area is, not where it lies), and so many metres more on every
     side."""
     verify: bool | None = None
-    """Hold every byte of the pictures to its checksum before training; None does so when they have at most 1 GiB
-    (about a second). That every picture is there, whole and of the right size is always checked."""
+    """Decode every picture before training, each byte held to its checksum; None does so when they have at most
+    256 MiB (100 views of 640x480 take about a second). That every picture is there, whole and of the right size is
+    always checked."""
 
 
 @dataclass(frozen=True)
@@ -98,14 +101,19 @@ class AVPDataParser(DataParser):
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
         try:
+            check_device(self.config.data)
             return self._outputs(split)
-        except RolloutError as error:
+        except AVPError as error:
+            discard_outputs()
             raise UnusableRolloutError(str(error)) from None
 
     @functools.cached_property
     def _parsed(self) -> _Parsed:
         config = self.config
         _check_options(config)
+        for path in (config.data, *config.also):
+            check_is_there(path)
+            check_is_rollout(path)
         rollout = read_merged(config.data, config.also)
         frames = chosen_views(rollout.frames, every=config.every, max_views=config.max_views, order=config.order)
         if not frames:
@@ -189,11 +197,8 @@ def _cameras(poses: NDArray[np.float32], intrinsics: Intrinsics) -> Cameras:
 
 
 def _no_heldout_views(rollout: Rollout, split: str) -> str:
-    scene = rollout.meta.get("scene")
-    name = scene.get("name") if isinstance(scene, dict) else None
-    again = (
-        f"python -m avp_habitat.collect --scene {shlex.quote(str(name or 'SCENE'))} --policy POLICY --out NEW_FOLDER"
-    )
+    scene = shlex.quote(name_of(rollout.meta, "scene") or "SCENE")
+    again = f"python -m avp_habitat.collect --scene {scene} --policy POLICY --out NEW_FOLDER"
     return (
         f"{rollout.folder}: expected held-out views for the {split} split, found none; they are captured with the "
         f"rollout and no command adds them to a folder: collect it again with `{again}`, which captures 20 of them"

@@ -6,19 +6,20 @@ cores ten times slower.
 
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from nerfstudio.field_components.encodings import HashEncoding
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from avp_habitat.compiled import njit
+
 # Primes of the spatial hash (Müller et al., Instant Neural Graphics Primitives, 2022, Eq. 4), as nerfstudio has them.
 _PRIME_Y = 2654435761
 _PRIME_Z = 805459861
 
 
-@numba.njit(fastmath=True)
+@njit(fastmath=True)
 def _corners(x, y, z, base, mask):  # pragma: no cover - compiled
     """Table rows of the 8 grid corners around a point, x fastest; written out, since loops cost ten times as much."""
     x0, y0, z0 = np.int64(x), np.int64(y) * _PRIME_Y, np.int64(z) * _PRIME_Z
@@ -36,7 +37,7 @@ def _corners(x, y, z, base, mask):  # pragma: no cover - compiled
     )
 
 
-@numba.njit(fastmath=True)
+@njit(fastmath=True)
 def _weights(x, y, z):  # pragma: no cover - compiled
     """Trilinear weights of the 8 grid corners around a point, in the order of `_corners`."""
     one = np.float32(1)
@@ -46,7 +47,7 @@ def _weights(x, y, z):  # pragma: no cover - compiled
     return x0 * w00, x1 * w00, x0 * w10, x1 * w10, x0 * w01, x1 * w01, x0 * w11, x1 * w11
 
 
-@numba.njit(fastmath=True, cache=True)
+@njit(fastmath=True, cache=True)
 def _encode(positions, scalings, table, mask, encoded):  # pragma: no cover - compiled
     features = table.shape[1]
     for i in range(positions.shape[0]):
@@ -61,7 +62,7 @@ def _encode(positions, scalings, table, mask, encoded):  # pragma: no cover - co
                 encoded[i, level * features + k] = near + far
 
 
-@numba.njit(fastmath=True, cache=True)
+@njit(fastmath=True, cache=True)
 def _spread(positions, scalings, mask, gradient, out):  # pragma: no cover - compiled
     features = out.shape[1]
     for level in range(scalings.shape[0]):

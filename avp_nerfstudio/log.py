@@ -14,8 +14,10 @@ from tqdm import tqdm
 
 from avp_habitat import command
 from avp_habitat.errors import RolloutError, UsageError
+from avp_habitat.metrics import TERMS, explained
 from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, address_of
 from avp_habitat.tracking.early import open_store
+from avp_habitat.tracking.experiments import DEFAULT_HELP
 from avp_habitat.tracking.looking import about_run
 from avp_nerfstudio.tracking_mlflow import open_again
 from avp_nerfstudio.trained_run import TrainedRun, config_path, open_trained, read_config
@@ -233,7 +235,7 @@ def _parser() -> argparse.ArgumentParser:
         "--experiment",
         metavar="NAME",
         help="MLflow experiment of a new run (default: that of the rollout's run, below which this one then appears: "
-        "the one in which its policy was trained, else avp)",
+        f"the one in which its policy was trained, else {DEFAULT_HELP})",
     )
     add("--rerun", type=Path, metavar="FILE", help="write a Rerun recording (.rrd) to this file, which must not exist")
     add("--pictures", type=int, metavar="N", help="keep pictures of N views, evenly spread (default: all)")
@@ -264,6 +266,7 @@ def main(argv: Sequence[str]) -> None:
     logged = log(request)
     for name, value in logged.scores.items():
         print(f"  {name:<20} {value:.4f}")
+    print(explained(*(name.upper() for name in logged.scores if name.upper() in TERMS)))
     print(f"pictures and table: {logged.table.parent}")
     if request.rerun is not None:
         print(f"recording:          rerun {shlex.quote(str(request.rerun))}")

@@ -7,11 +7,23 @@ dataparser while the modules that the method needs are still half imported.
 
 import functools
 import logging
+import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 _LOGGER = logging.getLogger(__name__)
+# What nerfstudio 1.1.5 makes the torch of today say at every command, none of which its users can change.
+_HARMLESS: tuple[tuple[str, type[Warning]], ...] = (
+    (r"`torch\.jit\.script` is deprecated", FutureWarning),
+    (r"`torch\.cuda\.amp\.(custom_fwd|custom_bwd|GradScaler)\(", FutureWarning),
+    (r"torch\.cuda\.amp\.GradScaler is enabled, but CUDA is not available", UserWarning),
+    (r"This DataLoader will create \d+ worker processes", UserWarning),
+    (r"Using a non-tuple sequence for multidimensional indexing is deprecated", UserWarning),
+    (r"Converting a tensor with requires_grad=True to a scalar", UserWarning),
+    (r"Importing `spectral_angle_mapper` from `torchmetrics\.functional` was deprecated", FutureWarning),
+)
 
 
 @dataclass(frozen=True)
@@ -53,6 +65,13 @@ def _videos() -> None:
     offer_ffmpeg()
 
 
+def _quiet() -> None:
+    """Leave out known harmless warnings, unless warnings were asked for (`python -W`, `PYTHONWARNINGS`)."""
+    if not sys.warnoptions:
+        for message, category in _HARMLESS:
+            warnings.filterwarnings("ignore", message, category)
+
+
 _PLUGS: dict[str, tuple[str, Callable[[], Any]]] = {
     "AVPData": ("avp-data", _data),
     "AVPNerfacto": ("avp-nerfacto", _nerfacto),
@@ -84,5 +103,6 @@ def __getattr__(name: str) -> Any:
     return _made(name)
 
 
+_guarded("quiet", _quiet)
 _guarded("loading of checkpoints", _checkpoints)
 _guarded("writing of videos", _videos)

@@ -15,6 +15,7 @@ from typing import Any
 
 from avp_habitat import command
 from avp_habitat.errors import RolloutError, UsageError, unknown_name
+from avp_habitat.metrics import explained
 from avp_habitat.new_folder import NewFolder
 from avp_habitat.rollout import Rollout, read_rollout
 from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, address_of
@@ -152,6 +153,7 @@ def main(argv: Sequence[str]) -> None:
     words = ", ".join(f"{name} {value:.4g}" for name, value in found["scores"].items() if value is not None)
     missing = "" if found["lpips_reason"] is None else ", no lpips (scores.json says why)"
     print(f"{request.out}: {words}{missing}")
+    print(explained("PSNR", "SSIM", "LPIPS"))
 
 
 if __name__ == "__main__":

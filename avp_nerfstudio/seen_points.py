@@ -1,14 +1,11 @@
 """Points that the cameras saw, from some pixels of some depth images."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.errors import RolloutError
 from avp_habitat.images import read_depth, read_rgb
 from avp_habitat.poses import Intrinsics, pixel_directions, y_up_to_z_up
 from avp_habitat.rollout import View
@@ -49,12 +46,12 @@ def seen_points(views: Sequence[View], intrinsics: Intrinsics, *, colours: bool)
     directions = pixel_directions(intrinsics)[grid]
     points, rgb = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
     for view in (views[index] for index in chosen):
-        depth = _decoded(read_depth, view.depth)[grid]
+        depth = read_depth(view.depth)[grid]
         seen = depth > 0
         pose = view.camera_to_world
         points.append((directions[seen] * depth[seen, None]) @ pose[:3, :3].T + pose[:3, 3])
         if colours:
-            rgb.append(_decoded(read_rgb, view.image)[grid][seen])
+            rgb.append(read_rgb(view.image)[grid][seen])
     return SeenPoints(_z_up(np.concatenate(points)).astype(np.float32), np.concatenate(rgb))
 
 
@@ -85,10 +82,3 @@ def scene_box(views: Sequence[View], points: SeenPoints, *, margin_m: float) -> 
 
 def _z_up(points: NDArray[np.floating]) -> NDArray[np.floating]:
     return points @ y_up_to_z_up(np.eye(4))[:3, :3].T
-
-
-def _decoded(read: Callable[[Path], NDArray[Any]], path: Path) -> NDArray[Any]:
-    try:
-        return read(path)
-    except (OSError, ValueError, SyntaxError) as error:
-        raise RolloutError(f"{path}: expected a readable PNG, could not decode it: {error}") from None

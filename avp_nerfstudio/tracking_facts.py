@@ -59,6 +59,10 @@ def facts_of(config: Any) -> Facts:
     }
     if policy_runs:
         tags[rollout_facts.POLICY_RUN_TAG] = joined(policy_runs)
+    title = rollout_facts.title(metas[0])
+    if title is not None and len(folders) == 1 and config.experiment_name == folders[0].stem:
+        # nerfstudio's own name, that of the folder, which may be any.
+        name = f"{config.method_name} {title}"
     # The figures of a rollout are those of all its frames and of no others.
     prefix = "eval" if _is_whole(config) else "rollout"
     return Facts(

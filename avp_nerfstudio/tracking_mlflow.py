@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from avp_habitat.tracking.addresses import DEFAULT_EXPERIMENT, TrackingError
+from avp_habitat.tracking.addresses import TrackingError
 from avp_habitat.tracking.early import open_store
 from avp_habitat.tracking.journal import Journal, spool_folder
 from avp_habitat.tracking.opening import NewRun, continue_run, join_run, journal_of, may_continue, start_run
@@ -37,7 +37,8 @@ def open_run(
         address: of the store.
         facts: of the training.
         folder: of the training, where the run's id is remembered.
-        experiment: MLflow's, made when it does not exist; `avp` when neither named nor given by the runs above.
+        experiment: MLflow's, made when it does not exist; when neither named nor given by the runs above,
+            as `experiments.meant` says.
         earlier: id of the run that is continued.
 
     Raises:
@@ -133,7 +134,7 @@ class _Above:
         policy = facts.policy_runs[0] if len(facts.policy_runs) == 1 else None
         self.tags: dict[str, str] = {}
         self.parent = policy
-        self.experiment = experiment or DEFAULT_EXPERIMENT
+        self.experiment = experiment
         if client is None:
             return
         rollouts = [rollout_run(client, folder, experiment=experiment) for folder in facts.rollouts]

@@ -5,6 +5,7 @@ a program, so open only those of your own trainings. The checkpoint beside it is
 """
 
 import json
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,7 +58,9 @@ def _kept_by_reconstruction(folder: Path) -> str | None:
         config = json.loads((folder / "scores.json").read_text(encoding="utf-8")).get("config")
     except (OSError, ValueError, AttributeError):
         return None
-    if not isinstance(config, str) or not (folder / config).resolve().is_relative_to(folder.resolve()):
+    if not isinstance(config, str) or not Path(os.path.abspath(folder / config)).is_relative_to(
+        os.path.abspath(folder)
+    ):
         raise TrainedRunError(f"{folder}: kept no checkpoint; reconstruct with --keep-checkpoint to open it again")
     return config
 

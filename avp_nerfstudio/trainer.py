@@ -20,6 +20,7 @@ from avp_habitat.tracking.addresses import address_of
 from avp_habitat.tracking.early import open_store
 from avp_habitat.tracking.run import Status
 from avp_nerfstudio.interruption import Interruption
+from avp_nerfstudio.running import discard_outputs
 from avp_nerfstudio.tracking import Trackers
 from avp_nerfstudio.trained_run import loading_fault, newest_checkpoint
 from avp_nerfstudio.training_progress import TrainingProgress
@@ -49,7 +50,7 @@ class AVPTrainerConfig(TrainerConfig):
     password in MLFLOW_TRACKING_PASSWORD, since options are written to config.yml."""
     mlflow_experiment: str | None = None
     """MLflow experiment; by default that of the rollout's run, below which this run then appears: the one in which the
-    rollout's policy was trained, else `avp`."""
+    rollout's policy was trained, else MLFLOW_EXPERIMENT_NAME or MLFLOW_EXPERIMENT_ID, else `avp`."""
     rerun: Path | None = None
     """Write a Rerun recording of losses and cameras to this file (.rrd), which must not exist."""
 
@@ -57,6 +58,11 @@ class AVPTrainerConfig(TrainerConfig):
         """The first thing ns-train asks for: refuse a device that is not there before anything is written."""
         check_device(self.machine)
         super().set_timestamp()
+
+    def print_to_terminal(self) -> None:
+        """What matters of the settings; all of them would be 190 lines, and stand in config.yml."""
+        data = self.data or self.pipeline.datamanager.data or "no data"
+        print(f"{self.method_name}: {self.max_num_iterations} iterations with {data} on {self.machine.device_type}")
 
 
 def check_device(machine: MachineConfig) -> None:
@@ -111,6 +117,9 @@ class AVPTrainer(Trainer):
                 self._fit_schedules()
                 if comms.is_main_process():
                     self._trackers = Trackers.of(self.config, address, self.pipeline)
+        except TrainingError:
+            discard_outputs(self.config)
+            raise
         except KeyboardInterrupt:
             raise SystemExit(INTERRUPTED) from None
 

@@ -2,19 +2,24 @@
 
 import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 from tqdm import tqdm
 
 from avp_habitat.errors import RolloutError
+from avp_habitat.images import read_depth, read_rgb
 from avp_habitat.png import check_png_contents
 from avp_habitat.rollout import View
 
-AUTOMATIC_BYTES = 1 << 30
-"""Pictures of up to this size together are checked without being asked: about a second's reading."""
+AUTOMATIC_BYTES = 1 << 28
+"""Pictures of up to this size together are decoded without being asked: about 600 views of 640x480, seven seconds."""
+_THREADS = 2
 
 
 def verify_pictures(views: Sequence[View], *, wanted: bool | None) -> None:
-    """Hold every byte of the pictures and depth images to its checksum; shows its progress when it takes long.
+    """Decode the pictures and depth images, with every byte held to its checksum; shows progress when it takes long.
+
+    A training decodes them all anyway, but ends in Pillow's traceback then. 11 ms for a view of 640x480 on one core.
 
     Args:
         views: whose files.
@@ -26,8 +31,23 @@ def verify_pictures(views: Sequence[View], *, wanted: bool | None) -> None:
     paths = [path for view in views for path in (view.image, view.depth)]
     if wanted is False or (wanted is None and _bytes_exceed(paths, AUTOMATIC_BYTES)):
         return
-    for path in tqdm(paths, desc="checking pictures", unit="file", delay=2, leave=False, disable=None):
+    with ThreadPoolExecutor(_THREADS) as threads:
+        for _ in tqdm(
+            threads.map(_verify, views),
+            total=len(views),
+            desc="checking pictures",
+            unit="view",
+            delay=2,
+            leave=False,
+            disable=None,
+        ):
+            pass
+
+
+def _verify(view: View) -> None:
+    for path, read in ((view.image, read_rgb), (view.depth, read_depth)):
         check_png_contents(path)
+        read(path)
 
 
 def _bytes_exceed(paths: Sequence[os.PathLike[str]], limit: int) -> bool:

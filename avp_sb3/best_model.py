@@ -13,6 +13,7 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from avp_habitat.errors import AVPError, UsageError
+from avp_habitat.saved_model import statistics_names
 
 WHEN = "DATE-TIME"
 """In a file's name: replaced by when the training started."""
@@ -80,7 +81,7 @@ class BestModel:
         if self.path is not None:
             setattr(model, _BEST, {"score": self._score, "value": value, "step": model.num_timesteps})
             try:
-                _save(model, self.path)
+                save_model(model, self.path)
             except OSError as error:
                 warnings.warn(f"best_model {self.path}: not written: {error}", stacklevel=2)
                 return False
@@ -121,10 +122,15 @@ class BestModel:
 
 def statistics_of(path: Path) -> Path:
     """Beside a model that trains with `VecNormalize`: the statistics without which it is worth nothing."""
-    return path.with_name(f"{path.stem}_vecnormalize.pkl")
+    return statistics_names(path)[0]
 
 
-def _save(model: BaseAlgorithm, path: Path) -> None:
+def save_model(model: BaseAlgorithm, path: Path) -> None:
+    """Write a model, and beside it the statistics of a training with `VecNormalize`; each file is whole or not there.
+
+    Raises:
+        OSError: it cannot be written.
+    """
     normalised = model.get_vec_normalize_env()
     if normalised is not None:
         _replace(statistics_of(path), normalised.save)

@@ -87,6 +87,7 @@ class Contestant:
         up: str | None = None,
         observation: str | None = None,
         stochastic: bool = False,
+        trusted: bool = False,
     ) -> None:
         """Open the scene and the policy.
 
@@ -100,6 +101,7 @@ class Contestant:
             up: axis of a mesh file that points up, `y` or `z`; what is known of the file when omitted.
             observation: kind of observation; what the model was trained on when omitted.
             stochastic: sample a model's actions instead of taking the likeliest.
+            trusted: open a model's file also where that may run code which the file holds.
 
         Raises:
             UsageError: an unknown name.
@@ -113,7 +115,7 @@ class Contestant:
         self._stochastic = stochastic
         opened = make_simulator(simulator, scene, gpu=gpu, navmesh=navmesh, up=up)
         self.env, self._policy = make_policy_env(
-            policy, opened, replace(settings, lookup=False), observation=observation
+            policy, opened, replace(settings, lookup=False), observation=observation, trusted=trusted
         )
 
     @property
@@ -166,7 +168,7 @@ def evaluate_policy(
         seed: of the first episode.
         settings: of the task; the design's defaults when omitted. Visibility is always computed, never looked up.
         on_episode: called after each episode.
-        **options: `simulator`, `gpu`, `navmesh`, `up`, `observation` and `stochastic` of `Contestant`.
+        **options: `simulator`, `gpu`, `navmesh`, `up`, `observation`, `stochastic` and `trusted` of `Contestant`.
 
     Raises:
         AVPError: as `Contestant`.

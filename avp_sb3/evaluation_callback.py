@@ -68,7 +68,7 @@ class EvaluationCallback(BaseCallback):
         gpu: int | None = None,
         navmesh: str | Path | None = None,
         up: str | None = None,
-        verbose: int = 0,
+        verbose: int = 1,
     ) -> None:
         """Describe the evaluation; scenes are opened when the training starts.
 
@@ -93,7 +93,7 @@ class EvaluationCallback(BaseCallback):
             gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
             navmesh: file of the only scene's NavMesh; computed when omitted.
             up: axis of mesh files that points up, `y` or `z`; of each file what is known of it when omitted.
-            verbose: 1 prints when a better model is kept.
+            verbose: 1 prints at the end where the best model is, 2 also when a better one is kept; 0 prints nothing.
 
         Raises:
             UsageError: a number, name or combination that cannot be right.
@@ -153,6 +153,8 @@ class EvaluationCallback(BaseCallback):
         if is_learning(self.model) and self._evaluated_at != self.num_timesteps:
             self._evaluate()
         self._close()
+        if self.verbose and self.best_model is not None and self.best is not None:
+            print(f"best:     {self.best_model}, {self._score} {self.best:.4g} in the evaluation", flush=True)
 
     def _close(self) -> None:
         if self._given is None and self._env is not None:
@@ -219,7 +221,7 @@ class EvaluationCallback(BaseCallback):
         if self.model.get_vec_normalize_env() is not None:
             file = LoggedFile(statistics, "best_model_vecnormalize.pkl")
             self.logger.record("eval/best_model_vecnormalize", file, exclude=NOT_FOR)
-        if self.verbose:
+        if self.verbose > 1:
             print(f"{path}: the best model so far, {self._score} {value:.4g} after {self.num_timesteps} steps")
 
 

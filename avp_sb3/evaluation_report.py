@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from avp_habitat.errors import AVPError, UsageError
-from avp_habitat.metrics import coverage_per_view
+from avp_habitat.metrics import coverage_per_view, explained
 from avp_habitat.provenance import git_commit
 from avp_habitat.versions import installed_versions
 from avp_sb3.evaluation import PolicyResult
@@ -56,6 +56,9 @@ _SHOWN = {
     "collisions": _Figure("collisions"),
     "redundant_share": _Figure("redundant views [%]", 100),
 }
+
+LEGEND = f"{explained('coverage', 'ANND', 'EI', 'CpV', 'redundant views', 'stop')}; ±: half of the 95 % interval"
+"""One line to print below a table."""
 
 
 def table(results: Sequence[PolicyResult]) -> str:
@@ -110,7 +113,7 @@ def write_report(folder: Path, results: Sequence[PolicyResult], about: Mapping[s
     try:
         temporary.mkdir(parents=True)
         (temporary / JSON_FILE).write_text(_json(results, about), encoding="utf-8")
-        (temporary / TABLE_FILE).write_text(table(results) + "\n", encoding="utf-8")
+        (temporary / TABLE_FILE).write_text(f"{table(results)}\n\n{LEGEND}\n", encoding="utf-8")
         _write_csv(temporary / CSV_FILE, results)
         _plot(temporary / PLOT_FILE, results)
         temporary.rename(folder)

@@ -15,8 +15,10 @@ from mlflow.exceptions import MlflowException
 from mlflow.tracking.context.registry import resolve_tags
 from numpy.typing import NDArray
 
+from avp_habitat.metrics import explained
 from avp_habitat.provenance import flat
-from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, TrackingError, connect, experiment_id, first_line, shown
+from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, TrackingError, connect, first_line, shown
+from avp_habitat.tracking.experiments import experiment_id, meant
 from avp_habitat.tracking.names import safe_name
 from avp_habitat.tracking.view import COLOUR_TAG, NOTE_TAG, prepare_experiment, run_colour
 from avp_sb3.evaluation import PolicyResult
@@ -27,6 +29,7 @@ TABLE = "policies.json"
 """Artifact of the upper run that MLflow's page shows as a table."""
 KIND_TAG, KIND = "avp.kind", "evaluation"
 _TOLD = ("policy", "coverage [%]", "views", "CpV [%/view]", "ended by a stop [%]", "episodes")
+_TERMS = f"{explained('coverage', 'views', 'CpV', 'stop')}."
 _PREFIX = "eval"
 _MAX_PARAM, _MAX_TAG = 6000, 5000
 
@@ -36,10 +39,10 @@ def track_evaluation(
     about: Mapping[str, Any],
     folder: Path,
     *,
-    experiment: str,
+    experiment: str | None,
     complete: bool = True,
     pictures: Mapping[str, NDArray[np.uint8]] | None = None,
-) -> tuple[str, str]:
+) -> tuple[str, str, str]:
     """Log an evaluation.
 
     The upper run holds the table of the policies and the plot of their curves. Each policy's run holds `eval/FIGURE`
@@ -51,7 +54,7 @@ def track_evaluation(
         results: of the policies.
         about: what was evaluated; becomes parameters.
         folder: of the report; its files become artifacts of the upper run.
-        experiment: MLflow experiment, made when it does not exist.
+        experiment: MLflow experiment, made when it does not exist; as `experiments.meant` says when None.
         complete: False marks the runs as interrupted.
         pictures: `(h, w, 3)` by policy, for those that have one.
 
@@ -59,18 +62,19 @@ def track_evaluation(
         ReportError: MLflow failed; the report is on disk.
 
     Returns:
-        The upper run's id and the address of the store without a password: what is configured, else
-        `sqlite:///mlflow.db`.
+        The upper run's id, the experiment's name, and the address of the store without a password: what is
+        configured, else `sqlite:///mlflow.db`.
     """
     address = mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else DEFAULT_ADDRESS
     try:
         client = connect(address)
-        identity, _ = experiment_id(client, experiment)
+        identity, _ = experiment_id(client, *meant(experiment))
         prepare_experiment(client, identity)
         parent = _log(client, identity, results, about, folder, "FINISHED" if complete else "KILLED", pictures or {})
+        name = client.get_experiment(identity).name
     except (MlflowException, TrackingError, OSError) as error:
         raise ReportError(f"the report is in {folder}, but MLflow did not take it: {first_line(error)}") from error
-    return parent, shown(address)
+    return parent, name, shown(address)
 
 
 def _log(
@@ -134,7 +138,7 @@ def _log_table(client: MlflowClient, run: str, results: Sequence[PolicyResult], 
     told = {title: columns[title] for title in _TOLD if title in columns}
     rows = [told, ["---"] * len(told), *zip(*told.values(), strict=True)]
     lines = [f"| {' | '.join(row)} |" for row in rows]
-    note = "\n".join([*lines, "", "Means over the episodes; ± is half of the 95 % interval."])
+    note = "\n".join([*lines, "", "Means over the episodes; ± is half of the 95 % interval.", "", _TERMS])
     client.set_tag(run, NOTE_TAG, note[:_MAX_TAG])
 
 

@@ -1,12 +1,15 @@
 """The task's figures, averaged over the last episodes, in Stable-Baselines3's logger."""
 
+import sys
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
+from tqdm import tqdm
 
 from avp_habitat.metrics import coverage_per_view
+from avp_habitat.progress import progress
 from avp_sb3.finished_episodes import MissingInfoError, finished_episodes, required
 
 MEANS = {
@@ -31,8 +34,8 @@ class EpisodeWindow:
         if size < 1:
             raise ValueError(f"expected a window of at least 1 episode, got {size}")
         self._size = size
-        self._keys: list[str] = []
-        self._rows = np.empty((0, 0))
+        self._keys = [*MEANS]
+        self._rows = np.zeros((size, len(self._keys)))
         self._added = 0
 
     def add(self, episode: Mapping[str, float]) -> None:
@@ -45,9 +48,11 @@ class EpisodeWindow:
             MissingInfoError: a key of `MEANS`, or the return of a reward part that earlier episodes had, is missing or
                 no number.
         """
-        if not self._added:
-            self._keys = [*MEANS, *sorted(key for key in episode if key.startswith(_RETURN))]
-            self._rows = np.empty((self._size, len(self._keys)))
+        new = [key for key in episode if key.startswith(_RETURN) and key not in self._keys]
+        if new:
+            # A part that earlier episodes did not have gave them nothing.
+            self._keys += sorted(new)
+            self._rows = np.hstack([self._rows, np.zeros((self._size, len(new)))])
         self._rows[self._added % self._size] = [_number(episode, key) for key in self._keys]
         self._added += 1
 
@@ -89,23 +94,29 @@ class MetricsCallback(BaseCallback):
     """Records coverage, CpV, ANND, EI, views, stop share, collisions, redundancy and the return of each reward part.
 
     They appear wherever SB3 logs (screen, CSV, TensorBoard, MLflow) as `avp/...` and `reward/...`, averaged over the
-    last `window` episodes like SB3's own `rollout/ep_rew_mean`.
+    last `window` episodes like SB3's own `rollout/ep_rew_mean`. Where SB3 itself prints nothing (`verbose=0` and no
+    progress bar on a terminal), this shows how far the training is: steps, rate, time left, coverage.
     """
 
-    def __init__(self, window: int = 100, verbose: int = 0) -> None:
+    def __init__(self, window: int = 100, verbose: int = 1) -> None:
         """Set the window.
 
         Args:
             window: episodes to average over.
-            verbose: as in SB3.
+            verbose: 0 shows no progress.
         """
         super().__init__(verbose)
+        self._bar: tqdm | None = None
         self._size = window
         self._window = EpisodeWindow(window)
 
     def _on_training_start(self) -> None:
         if self.num_timesteps == 0:
             self._window = EpisodeWindow(self._size)
+        has_bar = self.locals.get("progress_bar") and sys.stdout.isatty()
+        if self.verbose and not self.model.verbose and not has_bar:
+            total = self.model._total_timesteps
+            self._bar = progress(total=total, initial=self.num_timesteps, desc="training", unit="step")
 
     def _on_step(self) -> bool:
         finished = finished_episodes(self.locals)
@@ -118,6 +129,23 @@ class MetricsCallback(BaseCallback):
     def _on_rollout_end(self) -> None:
         # A rollout in which no episode ended still shows the window, as SB3 does with its own.
         self._record()
+        self._show()
+
+    def _on_training_end(self) -> None:
+        self._show()
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+    def _show(self) -> None:
+        if self._bar is None:
+            return
+        coverage = self._window.means().get("avp/coverage")
+        if coverage is not None:
+            self._bar.set_postfix_str(f"coverage {100 * coverage:.1f} %", refresh=False)
+        # The last rollout may go beyond what was asked for.
+        self._bar.total = max(self._bar.total, self.num_timesteps)
+        self._bar.update(self.num_timesteps - self._bar.n)
 
     def _record(self) -> None:
         for name, value in self._window.means().items():

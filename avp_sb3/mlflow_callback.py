@@ -6,6 +6,7 @@ import logging
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -15,20 +16,21 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from avp_habitat.errors import UsageError
 from avp_habitat.provenance import flat
-from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, DEFAULT_EXPERIMENT, shown
+from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, shown
 from avp_habitat.tracking.journal import spool_folder
+from avp_habitat.tracking.looking import about_run
 from avp_habitat.tracking.opening import NewRun, continue_run, join_run, may_continue, start_run
 from avp_habitat.tracking.recovery import recover_in_background
 from avp_habitat.tracking.run import Status, TrackedRun
 from avp_sb3.finished_episodes import finished_episodes
 from avp_sb3.learning import is_learning
 from avp_sb3.mlflow_writer import MLflowWriter
-from avp_sb3.run_facts import hyperparameters, scene_tags, task_settings
+from avp_sb3.run_facts import hyperparameters, run_name, scene_tags, task_settings
 
 if TYPE_CHECKING:
     from avp_habitat.trajectory import Trajectory
 
-MODEL_FILE = "model.zip"
+MODEL_FILE, STATISTICS_FILE = "model.zip", "model_vecnormalize.pkl"
 PARAMS_FILE = "params.json"
 TRAJECTORY_FILE = "trajectory.png"
 _log = logging.getLogger(__name__)
@@ -60,7 +62,7 @@ class MLflowCallback(BaseCallback):
 
     def __init__(
         self,
-        experiment: str = DEFAULT_EXPERIMENT,
+        experiment: str | None = None,
         run_name: str | None = None,
         tracking_uri: str | None = None,
         *,
@@ -70,29 +72,31 @@ class MLflowCallback(BaseCallback):
         offline: bool | None = None,
         params: Mapping[str, Any] | None = None,
         tags: Mapping[str, str] | None = None,
-        verbose: int = 0,
+        verbose: int = 1,
     ) -> None:
         """Describe the run; nothing is contacted before the training starts.
 
         Args:
-            experiment: MLflow experiment, made when it does not exist. Not used within an active run.
-            run_name: name of the run; MLflow invents one when omitted.
+            experiment: MLflow experiment, made when it does not exist; when omitted, what `mlflow.set_experiment`,
+                `MLFLOW_EXPERIMENT_ID` or `MLFLOW_EXPERIMENT_NAME` say, else `avp`. Not used within an active run.
+            run_name: name of the run; when omitted, algorithm, reward, scene and seed.
             tracking_uri: where runs are kept; when omitted, what `mlflow.set_tracking_uri` or `MLFLOW_TRACKING_URI`
                 say, else `sqlite:///mlflow.db` in the current folder.
             run_id: go on with this run; when omitted, with the model's own if it was interrupted.
-            log_model: keep the model as artifact `model.zip`, at the end unless the training failed, and on the way.
+            log_model: keep the model as artifact `model.zip`, at the end unless the training failed, and on the way;
+                with `model_vecnormalize.pkl` where it trains under `VecNormalize`.
             checkpoint_s: seconds between two models that are kept on the way, each in place of the one before.
             offline: True goes on when the server does not answer at the start, and sends everything later; when
                 omitted, as the variable `AVP_MLFLOW_OFFLINE` says.
             params: further parameters; nested mappings become dotted names.
             tags: further tags.
-            verbose: 1 prints where the run is.
+            verbose: 1 prints at the end which run it was and how to look at it, 2 also at the start; 0 prints nothing.
 
         Raises:
             UsageError: a number that cannot be right.
         """
         super().__init__(verbose)
-        if checkpoint_s <= 0:
+        if not checkpoint_s > 0:
             raise UsageError(f"MLflowCallback checkpoint_s: expected seconds above 0, got {checkpoint_s}")
         self.run_id: str | None = None
         self._new = NewRun(experiment=experiment, name=run_name)
@@ -135,8 +139,10 @@ class MLflowCallback(BaseCallback):
         finally:
             if self._writer in self.logger.output_formats:
                 self.logger.output_formats.remove(self._writer)
-            run.close(status)
+            delivered = run.close(status)
             self._remember(run)
+            if self.verbose:
+                print(about_run(run.run_id, run.address, delivered=delivered), flush=True)
 
     def _on_training_start(self) -> None:
         self.close("KILLED")
@@ -156,8 +162,8 @@ class MLflowCallback(BaseCallback):
         recovery = recover_in_background(spool_folder())
         # The usual case, a store on this machine, is a matter of milliseconds; a slow server is not waited for.
         recovery.join(0.5)
-        if self.verbose:
-            print(f"MLflow run {run.run_id} at {shown(run.address)}")
+        if self.verbose > 1:
+            print(f"MLflow:   run {run.run_id} at {shown(run.address)}", flush=True)
 
     def _on_rollout_start(self) -> None:
         # Here the model is as it was after its last update, for which the step count stands.
@@ -192,7 +198,8 @@ class MLflowCallback(BaseCallback):
         earlier = self._models_run() if self.model.num_timesteps > 0 else None
         if earlier is not None and may_continue(address, earlier):
             return continue_run(address, earlier, offline=self._offline)
-        return start_run(address, self._new, offline=self._offline)
+        name = self._new.name or run_name(self.model, self.training_env)
+        return start_run(address, replace(self._new, name=name), offline=self._offline)
 
     def _models_run(self) -> str | None:
         """The run that trained the model so far."""
@@ -225,6 +232,8 @@ class MLflowCallback(BaseCallback):
 
     def _save_model(self, run: TrackedRun) -> None:
         if self._log_model:
+            if (normalised := self.model.get_vec_normalize_env()) is not None:
+                run.save(STATISTICS_FILE, lambda file: normalised.save(str(file)))
             run.save(MODEL_FILE, self.model.save)
 
     def _save_trajectory(self, run: TrackedRun) -> None:

@@ -41,8 +41,11 @@ def destination_of(options: argparse.Namespace) -> Destination:
     """What the caller wants the rollouts to be part of.
 
     Raises:
-        UsageError: a time is not a name and a whole number.
+        UsageError: a time is not a name and a whole number, or a name holds bytes that are no text.
     """
+    for option in ("application_id", "recording_id", "entity_path_prefix"):
+        if _is_no_text(getattr(options, option)):
+            raise UsageError(f"--{option.replace('_', '-')}: expected a text, got {getattr(options, option)!r}")
     joins = options.recording_id is not None and options.recording_id == options.opened_recording_id
     return Destination(
         application_id=options.application_id or APPLICATION,
@@ -51,6 +54,11 @@ def destination_of(options: argparse.Namespace) -> Destination:
         times=_times(options),
         own=not joins and not options.entity_path_prefix.strip("/"),
     )
+
+
+def _is_no_text(value: str | None) -> bool:
+    """Whether the command line held other bytes than UTF-8, which Python keeps as surrogates and Rerun refuses."""
+    return any("\ud800" <= letter <= "\udfff" for letter in value or "")
 
 
 def _times(options: argparse.Namespace) -> dict[str, Time]:

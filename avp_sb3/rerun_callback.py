@@ -1,6 +1,7 @@
 """Finished episodes of a training as a Rerun recording, in a file and live."""
 
 import atexit
+import shlex
 import sys
 import time
 from datetime import datetime
@@ -48,7 +49,7 @@ class RerunCallback(BaseCallback):
         height: int = 180,
         max_bytes: int = 500_000_000,
         max_share: float = 0.01,
-        verbose: int = 0,
+        verbose: int = 1,
     ) -> None:
         """Describe the recording; nothing is written before the training starts.
 
@@ -64,7 +65,7 @@ class RerunCallback(BaseCallback):
             height: of the pictures, pixels.
             max_bytes: nothing is added that would make the file larger than about this.
             max_share: recording may take this share of the training's time; 1 records every k-th episode.
-            verbose: 1 prints where the recording is.
+            verbose: 1 prints at the end where the recording is, 2 also at the start; 0 prints nothing.
 
         Raises:
             UsageError: an option that cannot be right.
@@ -112,8 +113,8 @@ class RerunCallback(BaseCallback):
         self.path = self._file.path
         # An interrupted training has no end that would finish the file.
         atexit.register(self._finish)
-        if self.verbose:
-            print(f"Rerun recording: {self.path}")
+        if self.verbose > 1:
+            print(f"Rerun:    {self.path}", flush=True)
         if self._live is not None:
             self._live.open(self._file.recording_id, self._blueprint())
         if missing := self._environments.missing:
@@ -151,6 +152,8 @@ class RerunCallback(BaseCallback):
         if self._live is not None:
             self._live.finish()
         self._file = None
+        if self.verbose:
+            print(f"Rerun:    rerun {shlex.quote(str(self.path))}", flush=True)
 
     def _is_due(self) -> bool:
         if self._episodes < self._due:

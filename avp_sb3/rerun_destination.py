@@ -44,6 +44,11 @@ class DestinationRecording(rr.RecordingStream):
         self._times = destination.times
         self._set_times()
 
+    def __del__(self) -> None:
+        """As `rerun.RecordingStream.__del__`, which asks for `inner` also where making the recording failed."""
+        if hasattr(self, "inner"):
+            super().__del__()
+
     def send_columns(
         self, entity_path: str, indexes: Iterable[Any], columns: Iterable[Any], *, strict: bool | None = None
     ) -> None:

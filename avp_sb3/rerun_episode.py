@@ -127,7 +127,7 @@ def log_episode(
     recording.send_columns(f"{world}/agent", clock.columns(range(steps)), _transforms(episode.camera_to_world))
     for name, values in episode.plots.items():
         columns = rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64))
-        recording.send_columns(f"{root}/plots/{name}", clock.columns(range(steps)), columns)
+        recording.send_columns(_plot_path(root, name), clock.columns(range(steps)), columns)
     if episode.views:
         _send_views(recording, f"{world}/camera", episode, clock)
 
@@ -168,7 +168,12 @@ def _log_scene(recording: rr.RecordingStream, root: str, episode: Episode) -> No
         colour = _PLOT_COLOURS[index % len(_PLOT_COLOURS)]
         dots = rr.SeriesPoints(colors=[colour], marker_sizes=[2])
         looks = dots if name == "action" else rr.SeriesLines(colors=[colour])
-        recording.log(f"{root}/plots/{name}", looks, static=True)
+        recording.log(_plot_path(root, name), looks, static=True)
+
+
+def _plot_path(root: str, name: str) -> str:
+    """Where a figure's curve is; its name may have signs that Rerun would not take as they are."""
+    return "/".join([root, "plots", *map(rr.escape_entity_path_part, name.split("/"))])
 
 
 def _send_floor(recording: rr.RecordingStream, path: str, episode: Episode, clock: _Clock) -> None:

@@ -42,13 +42,28 @@ def task_settings(env: VecEnv) -> dict[str, Any]:
     return flat({"env": facts})
 
 
+def run_name(model: BaseAlgorithm, env: VecEnv) -> str:
+    """Algorithm, reward, scene and seed, as far as there are any: `ppo proposed builtin:0 seed 0`.
+
+    MLflow would draw a name at random, the same one after each training with the same seed.
+    """
+    task, scenes = task_settings(env), _each_once(env, "scene_name")
+    where = scenes[0] if scenes else task.get("env.id")
+    more = f"and {len(scenes) - 1} more" if len(scenes) > 1 else None
+    seed = None if model.seed is None else f"seed {model.seed}"
+    words = (type(model).__name__.lower(), task.get("env.reward"), where, more, seed)
+    return " ".join(str(word) for word in words if word is not None)
+
+
 def scene_tags(env: VecEnv) -> dict[str, str]:
     """Names and SHA-256 digests of the scenes of all environments, each once, where they have such attributes."""
-    tags = {}
-    for attribute, tag in (("scene_name", "avp.scene"), ("scene_digest", "avp.scene_digest")):
-        if env.has_attr(attribute):
-            tags[tag] = ", ".join(dict.fromkeys(map(str, env.get_attr(attribute))))
-    return tags
+    named = {"avp.scene": _each_once(env, "scene_name"), "avp.scene_digest": _each_once(env, "scene_digest")}
+    return {tag: ", ".join(values) for tag, values in named.items() if values}
+
+
+def _each_once(env: VecEnv, attribute: str) -> list[str]:
+    """The values of an attribute over the environments; none where they have no such attribute."""
+    return list(dict.fromkeys(map(str, env.get_attr(attribute)))) if env.has_attr(attribute) else []
 
 
 def _plain(value: Any) -> Any:

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from avp_habitat.env import step_info
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics
+from avp_habitat.ranges import Range, number
 from avp_habitat.settings import TaskSettings
 from avp_habitat.simulators import ONE_PER_PROCESS, Frames, Simulator, SimulatorChoice, open_simulator
 from avp_habitat.spaces import action_space, observation_space
@@ -61,6 +62,7 @@ class AVPVecEnv(VecEnv):
         self.simulators = _open(scene, simulator, gpu=gpu, navmesh=navmesh, up=up)
         casts = all(each.name == "raycast" for each in self.simulators)
         self.settings = settings or TaskSettings(lookup=casts)
+        agents = number("agents", agents, int, Range(0, 1e12))
         if agents < len(self.simulators):
             raise UsageError(f"agents: expected at least {len(self.simulators)}, one for each scene, got {agents}")
         _check_memory(agents, self.simulators, self.settings)

@@ -62,16 +62,11 @@ class RecordingSimulator(RaycastSimulator):
             self._calls.append((rays, lambda: again(poses, intrinsics, rgb=rgb)))
         return super().render(camera_to_world, intrinsics, rgb=rgb)
 
-    def visible(
-        self,
-        camera_to_world: NDArray[np.floating],
-        points: NDArray[np.floating],
-        pairs: NDArray[np.integer],
-        *,
-        tolerance_m: float,
+    def reached(
+        self, eye: NDArray[np.floating], points: NDArray[np.floating], pairs: NDArray[np.integer], *, tolerance_m: float
     ) -> NDArray[np.bool_]:
-        """See `Simulator`."""
+        """See `SingleRays`."""
         if self._recording:
-            poses, rows, again = np.array(camera_to_world), np.array(pairs), super().visible
-            self._calls.append((len(rows), lambda: again(poses, points, rows, tolerance_m=tolerance_m)))
-        return super().visible(camera_to_world, points, pairs, tolerance_m=tolerance_m)
+            eyes, rows, again = np.array(eye), np.array(pairs), super().reached
+            self._calls.append((len(rows), lambda: again(eyes, points, rows, tolerance_m=tolerance_m)))
+        return super().reached(eye, points, pairs, tolerance_m=tolerance_m)

@@ -11,6 +11,9 @@ from typing import Any
 
 from avp_habitat import command
 from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.new_folder import check_writable
+from avp_habitat.policies import TRUSTED, load_model
+from avp_habitat.saved_model import is_normalised, load_statistics, statistics_of
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.settings import OBSERVATION_NAMES, TaskSettings
 from avp_habitat.simulators import ONE_PER_PROCESS, SimulatorChoice
@@ -18,10 +21,14 @@ from avp_habitat.simulators.options import add_simulator_options, simulator_choi
 from avp_sb3.presets import PRESETS, Preset
 
 _MLFLOW = "runs:/"
+_STATISTICS = "_vecnormalize.pkl"
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=f"{__doc__} 300,000 steps take about a minute on two CPU cores, ten times as long with the map.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
     add = parser.add_argument
     add("--scene", default=["builtin:0"], nargs="+", help=f"{SCENES}; agents share several")
     add("--reward", default="proposed", help="coverage, coverage_redundancy, proposed or surface")
@@ -41,10 +48,11 @@ def _parser() -> argparse.ArgumentParser:
         metavar="MODEL",
         help="go on until --steps are done with a model: a file, or MLflow's runs:/RUN_ID/model.zip",
     )
+    add("--trusted", action="store_true", help=TRUSTED)
     add("--eval-scene", default=None, nargs="+", metavar="SCENE", help="evaluate in these too, and keep the best model")
     add("--eval-every", default=150_000, type=int, help="environment steps between two evaluations")
     add("--recording", default=None, type=Path, help="the Rerun recording (.rrd) of some episodes; none when omitted")
-    add("--experiment", default="avp", help="of MLflow")
+    add("--experiment", default=None, help="of MLflow (default: MLFLOW_EXPERIMENT_NAME, else avp)")
     add("--run-name", default=None, help="of the MLflow run")
     return parser
 
@@ -86,19 +94,29 @@ def _environment(options: argparse.Namespace, preset: Preset, choice: SimulatorC
 
 
 def _model(options: argparse.Namespace, preset: Preset, env: Any) -> Any:
-    from stable_baselines3 import PPO
-
     if options.resume is None:
+        from stable_baselines3 import PPO
+
         return PPO("MlpPolicy", env, device="cpu", seed=options.seed, **preset.arguments())
     with tempfile.TemporaryDirectory() as folder:
         path = _resumed_file(options.resume, folder)
         try:
-            model = PPO.load(path, env=env, device="cpu")
+            model = load_model(path, env=_normalised(path, env, options.trusted), trusted=options.trusted)
         except ValueError as error:
             raise UsageError(f"--resume {options.resume}: does not fit these options: {error}") from None
     if model.num_timesteps >= options.steps:
         raise UsageError(f"--steps: {options.resume} has {model.num_timesteps} already; expected more")
     return model
+
+
+def _normalised(path: Path, env: Any, trusted: bool) -> Any:
+    """The environment as the model's training had it: under `VecNormalize` with its statistics, or as it is."""
+    statistics = statistics_of(path)
+    if statistics is None:
+        return env
+    normalised = load_statistics(statistics, env.observation_space, trusted=trusted)
+    normalised.set_venv(env)
+    return normalised
 
 
 def _resumed_file(resume: str, folder: str) -> Path:
@@ -121,6 +139,14 @@ def _resumed_file(resume: str, folder: str) -> Path:
         raise UsageError(f"--resume {resume}: not found at {shown(address)}: {first_line(error)}") from None
     if not Path(found).is_file():
         raise UsageError(f"--resume {resume}: expected a model file, found a folder; add /model.zip")
+    if is_normalised(Path(found)):
+        beside = resume.removesuffix(".zip") + _STATISTICS
+        try:
+            download_artifacts(artifact_uri=beside, dst_path=folder, tracking_uri=address)
+        except (MlflowException, OSError):
+            raise UsageError(
+                f"--resume {resume}: trained under VecNormalize, but its statistics {beside} are not with the run"
+            ) from None
     return Path(found)
 
 
@@ -144,11 +170,14 @@ def main(argv: Sequence[str]) -> None:
     options = _parser().parse_args(argv)
     preset = _preset(options)
     choice = simulator_choice(options)
+    check_writable(options.out)
+    print(f"opening {', '.join(options.scene)} …", flush=True)
 
     # Late, so that --help and a mistyped option answer at once.
     import torch
 
     from avp_sb3 import MLflowCallback
+    from avp_sb3.best_model import save_model
 
     # The policy is a small network: more threads of torch only wait for each other.
     torch.set_num_threads(1)
@@ -168,7 +197,7 @@ def main(argv: Sequence[str]) -> None:
         done = True
     finally:
         if model.num_timesteps > begun:
-            model.save(options.out)
+            save_model(model, options.out)
             print(f"{options.out}: the policy after {model.num_timesteps} steps; MLflow run {tracking.run_id}")
             if not done:
                 again = shlex.join(["python", "examples/train.py", *argv, "--resume", str(options.out)])

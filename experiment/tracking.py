@@ -11,12 +11,13 @@ from avp_habitat.intervals import mean_and_half_width
 from avp_habitat.provenance import flat
 from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, absolute, connect
 from avp_habitat.tracking.comparison import METHOD_TAG, POLICY_TAG, SCENE_TAG
+from avp_habitat.tracking.experiments import NAME_VARIABLE
 from avp_habitat.tracking.opening import NewRun, join_run, start_run
 from avp_habitat.tracking.remote import PARENT_TAG, existing_run, find_run
 from avp_habitat.tracking.run import Status, TrackedRun
 
 EXPERIMENT = "avp-experiment"
-"""MLflow experiment outside of `mlflow run`."""
+"""MLflow experiment outside of `mlflow run` where `MLFLOW_EXPERIMENT_NAME` names none."""
 KIND_TAG, KIND = "avp.kind", "experiment"
 _ARTIFACTS = ("*.md", "*.csv", "*.png", "results.json", "experiment.json")
 _SHOWN = ("views", "coverage", "annd_m", "ei", "path_length_m", "visibility", "collisions", "stopped")
@@ -53,8 +54,9 @@ def open_parent(name: str) -> Parent:
         identity = existing_run(client, begun).info.experiment_id
         client.set_tag(begun, KIND_TAG, KIND)
         return Parent(join_run(address, begun), client.get_experiment(identity).name)
-    run = start_run(address, NewRun(experiment=EXPERIMENT, name=name, tags={KIND_TAG: KIND}))
-    return Parent(run, EXPERIMENT)
+    experiment = os.environ.get(NAME_VARIABLE) or EXPERIMENT
+    run = start_run(address, NewRun(experiment=experiment, name=name, tags={KIND_TAG: KIND}))
+    return Parent(run, experiment)
 
 
 def log_results(parent: Parent, results: dict[str, Any], folder: Path) -> None:

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from avp_habitat.coverage import pairs_in_image
 from avp_habitat.poses import pixel_directions
 from avp_habitat.scenes.location import Frame
 from avp_habitat.simulators.base import Frames
@@ -81,8 +82,16 @@ def hit_distance(origins, directions):
     return np.minimum(shell, wall)
 
 
+def reached(eye, points, pairs, tolerance_m):
+    """`(k,)` whether rays from `(n, 3)` places reach `(m, 3)` points, for `(k, 2)` rows (place, point)."""
+    origins = eye[pairs[:, 0]]
+    rays = points[pairs[:, 1]] - origins
+    length = np.linalg.norm(rays, axis=1)
+    return hit_distance(origins, rays / length[:, None]) >= length - tolerance_m
+
+
 class Corridor:
-    """A `Simulator` of its own."""
+    """A `Simulator` of its own, which shows whole images only."""
 
     name = "corridor"
     version = "1"
@@ -105,11 +114,19 @@ class Corridor:
         colours = np.broadcast_to(RGB, (*shape, 3)).copy() if rgb else None
         return Frames(colours, depth.reshape(shape).astype(np.float32))
 
-    def visible(self, camera_to_world, points, pairs, *, tolerance_m):
-        origins = camera_to_world[pairs[:, 0], :3, 3]
-        rays = points[pairs[:, 1]] - origins
-        length = np.linalg.norm(rays, axis=1)
-        return hit_distance(origins, rays / length[:, None]) >= length - tolerance_m
+    def visible(self, camera_to_world, intrinsics, points, pairs, *, tolerance_m):
+        inside = pairs_in_image(camera_to_world, intrinsics, points, pairs)
+        return inside & reached(camera_to_world[:, :3, 3], points, pairs, tolerance_m)
 
     def close(self):
         pass
+
+
+class RayCorridor(Corridor):
+    """The same, casting single rays too."""
+
+    def reached(self, eye, points, pairs, *, tolerance_m):
+        return reached(eye, points, pairs, tolerance_m)
+
+    def distance(self, origin, direction):
+        return hit_distance(origin, direction)

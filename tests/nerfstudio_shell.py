@@ -46,13 +46,12 @@ class Shell:
         self._server.stdout.close()
         self._folder.cleanup()
 
-    def run(self, name, *arguments, environment=None):
-        return self.wait(self.start(name, *arguments, environment=environment))
+    def run(self, name, *arguments, environment=None, cwd=None):
+        return self.wait(self.start(name, *arguments, environment=environment, cwd=cwd))
 
-    def start(self, name, *arguments, environment=None):
-        return self._ask(
-            start=[name, *map(str, arguments)], environment=environment or {}, output=str(Path(self._folder.name))
-        )
+    def start(self, name, *arguments, environment=None, cwd=None):
+        words, output = [name, *map(str, arguments)], str(Path(self._folder.name))
+        return self._ask(start=words, environment=environment or {}, output=output, cwd=str(cwd or Path.cwd()))
 
     def wait(self, pid):
         code = self._ask(wait=pid)
@@ -92,5 +91,6 @@ if __name__ == "__main__":
     command = serve()
     redirect(command)
     os.environ.update(command["environment"])
+    os.chdir(command["cwd"])
     sys.argv = command["start"]
     entries[sys.argv[0]]()

@@ -69,6 +69,15 @@ def test_the_benchmark_of_scenes_measures_rooms_and_halls(tmp_path):
         assert 0 < row["made_share"] <= 1
 
 
+def test_the_benchmark_of_export_sets_written_views_beside_their_rays(tmp_path):
+    words = ("--scene", "builtin:1", "--views", 3, "--rounds", 2, "--width", 48, "--height", 36)
+    (row,) = report(run("export.py", *words, folder=tmp_path), tmp_path)["export"]
+    assert (row["scene"], row["views"]) == ("builtin:1", 3)
+    positive(row, "export_s", "first_s", "kb_per_view", "rays_cpu_ms")
+    assert 0 < row["cpu_share"] < 1
+    assert row["share"] == pytest.approx(row["export_per_s"] / row["rays_per_s"])
+
+
 @pytest.mark.slow
 def test_the_benchmark_of_training_compares_five_ways_and_measures_memory(tmp_path):
     words = ("--repeats", 1, "--steps", 1, "--cast-steps", 1, "--single-steps", 1, "--raw-seconds", 0.1)
@@ -93,6 +102,7 @@ def test_the_benchmark_of_training_compares_five_ways_and_measures_memory(tmp_pa
     [
         ("environment.py", ("--agents", 4, 0), "--agents: expected at least 1, got 0"),
         ("environment.py", ("--resolutions", "64"), "--resolutions: expected WIDTHxHEIGHT"),
+        ("export.py", ("--views", 0), "--views: expected at least 1, got 0"),
         ("scenes.py", ("--halls", 0), "--halls: expected at least 1, got 0"),
         ("training.py", ("--memory-agents", 3), "--agents, --memory-agents: expected divisors of 2048, got 3"),
     ],
@@ -129,15 +139,15 @@ def test_rays_are_remembered_only_between_start_and_stop_and_cast_again():
     from rays import RecordingSimulator
 
     simulator = RecordingSimulator(load_scene("builtin:0"))
-    pose = np.tile(np.eye(4), (2, 1, 1))
+    pose, eye = np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 3))
     camera = Intrinsics.from_hfov(8, 6, hfov_deg=90)
     points, pairs = np.array([[0.0, 0.0, -1.0]]), np.array([[0, 0], [1, 0]])
     simulator.render(pose, camera, rgb=False)
     simulator.start()
     simulator.render(pose, camera, rgb=False)
-    simulator.visible(pose, points, pairs, tolerance_m=0.1)
+    simulator.visible(pose, camera, points, pairs, tolerance_m=0.1)
     simulator.stop()
-    simulator.visible(pose, points, pairs, tolerance_m=0.1)
+    simulator.reached(eye, points, pairs, tolerance_m=0.1)
     assert simulator.count == 2 * 8 * 6 + 2
     assert simulator.replay()[0] == simulator.count
     assert simulator.replay(seconds=0.0)[0] == 2 * 8 * 6

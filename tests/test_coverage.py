@@ -40,7 +40,7 @@ def test_candidates_and_occlusion_rays_equal_the_definition(seed, max_range_m):
     pose = random_poses(seed, 2)
     unseen = np.random.default_rng(seed).random((2, len(CELLS))) < 0.8
     pairs = candidates(pose, camera, CELLS, unseen, max_range_m=max_range_m)
-    reached = SIMULATOR.visible(pose, CELLS, pairs, tolerance_m=TOLERANCE)
+    reached = SIMULATOR.visible(pose, camera, CELLS, pairs, tolerance_m=TOLERANCE)
     found = np.zeros_like(unseen)
     found[pairs[reached, 0], pairs[reached, 1]] = True
     for agent in range(2):
@@ -56,7 +56,7 @@ def test_depth_images_agree_with_occlusion_rays_at_any_resolution(width, height)
     pairs = candidates(pose, camera, CELLS, np.ones((12, len(CELLS)), dtype=bool), max_range_m=10.0)
     depth = SIMULATOR.render(pose, camera, rgb=False).depth
     by_depth = visible_in_depth(pose, camera, depth, CELLS, pairs, tolerance_m=TOLERANCE)
-    by_rays = SIMULATOR.visible(pose, CELLS, pairs, tolerance_m=TOLERANCE)
+    by_rays = SIMULATOR.visible(pose, camera, CELLS, pairs, tolerance_m=TOLERANCE)
     assert 0.2 < by_rays.mean() < 0.98, "the wall must hide some cells for this test to mean anything"
     assert (by_depth == by_rays).mean() > 0.99
     assert by_depth.mean() == pytest.approx(by_rays.mean(), abs=0.005)

@@ -246,7 +246,7 @@ def test_a_store_that_does_not_answer_leaves_the_report(tmp_path, monkeypatch, c
     monkeypatch.setattr(mlflow, "get_tracking_uri", lambda: "http://me:secret@127.0.0.1:9")
     monkeypatch.setattr(mlflow, "is_tracking_uri_set", lambda: True)
     assert evaluate("--policy", "spin", "--episodes", 1, "--out", "kept") == 1
-    error = capsys.readouterr().err.strip()
+    error = capsys.readouterr().err.strip().splitlines()[-1]
     assert error.startswith("error: the report is in kept, but MLflow did not take it: MLflow at http://127.0.0.1:9 ")
     assert "secret" not in error
     assert read_report(tmp_path / "kept")[0].policy == "spin"
@@ -262,6 +262,8 @@ def test_a_store_that_does_not_answer_leaves_the_report(tmp_path, monkeypatch, c
         (["--policy", "random", "--episodes", "0"], 2, "--episodes: expected at least 1, got 0"),
         (["--policy", "random", "--seed", "-1"], 2, "--seed: expected a whole number from 0, got -1"),
         (["--policy", "random", "--out", "."], 2, "--out .: exists already"),
+        (["--policy", "random", "--out", "/proc/no/r"], 1, "--out /proc/no/r: cannot write there: /proc"),
+        (["--policy", "random", "--out", "/dev/null/r"], 1, "--out /dev/null/r: cannot write there: /dev/null"),
         (["--policy", "random", "--scene", "gone.glb"], 1, r"gone\.glb: no such scene file"),
     ],
 )
@@ -280,7 +282,7 @@ def test_an_interrupted_evaluation_keeps_its_episodes(tmp_path, monkeypatch, cap
         if bar.n == 3:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("avp_sb3.evaluate.tqdm.update", interrupt)
+    monkeypatch.setattr("avp_habitat.progress.tqdm.update", interrupt)
     words = ["--policy", "random", "--policy", "heuristic", "--policy", "spin", "--no-mlflow", "--episodes", "2"]
     assert evaluate(*words, "--out", tmp_path / "kept") == 130
     assert "interrupted after 3 episodes, which are kept" in capsys.readouterr().out

@@ -1,5 +1,6 @@
 import json
 import os
+import pickle
 import shlex
 import signal
 import subprocess
@@ -10,8 +11,14 @@ from pathlib import Path
 
 import pytest
 from mlflow import MlflowClient
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from avp_habitat.rollout import read_rollout
+from avp_habitat.settings import TaskSettings
+from avp_sb3 import AVPVecEnv, MLflowCallback
+from avp_sb3.best_model import save_model
+from avp_sb3.presets import TABLE_4
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -172,3 +179,26 @@ def test_the_demo_compares_three_methods_and_is_not_repeated(tmp_path):
     other = run("demo.py", "--out", "d", "--steps", 4096, folder=tmp_path)
     assert other.returncode == 2
     assert "holds a demo with other settings" in other.stderr
+
+
+@pytest.mark.slow
+def test_a_normalised_training_goes_on_with_its_statistics_from_a_file_and_from_mlflow(tmp_path):
+    settings = TaskSettings(lookup=True, width=16, height=12)
+    env = VecNormalize(VecMonitor(AVPVecEnv("builtin:0", agents=16, settings=settings, seed=0)))
+    arguments = {**TABLE_4.arguments(), "n_steps": 128}
+    model = PPO("MlpPolicy", env, device="cpu", **arguments)
+    tracking = MLflowCallback(tracking_uri=f"sqlite:///{tmp_path / 'mlflow.db'}")
+    model.learn(2048, callback=tracking)
+    save_model(model, tmp_path / "first.zip")
+    words = ("--agents", 16, "--width", 16, "--height", 12, "--steps", 4096)
+    for resume, out in (("first.zip", "a.zip"), (f"runs:/{tracking.run_id}/model.zip", "b.zip")):
+        done = run("train.py", *words, "--resume", resume, "--out", out, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+        with (tmp_path / out.replace(".zip", "_vecnormalize.pkl")).open("rb") as file:
+            # One more than twice the steps of one training: observations of the start count, too.
+            assert pickle.load(file).obs_rms.count > 4096
+    (tmp_path / "first_vecnormalize.pkl").unlink()
+    refused = run("train.py", *words, "--resume", "first.zip", "--out", "c.zip", folder=tmp_path)
+    assert refused.returncode == 1
+    assert "first.zip: trained under VecNormalize" in refused.stderr
+    assert not (tmp_path / "c.zip").exists()

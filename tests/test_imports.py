@@ -25,6 +25,7 @@ LIGHT = (
     "observation",
     "trajectory",
     "errors",
+    "ranges",
 )
 ONE_FILE = {"habitat_sim": "simulators/habitat/engine.py", "open3d": "simulators/raycast.py"}
 NOT_AT_IMPORT = ("torch", "open3d", "habitat_sim", "mlflow", "rerun", "numba", "stable_baselines3", "trimesh", "scipy")
@@ -101,8 +102,8 @@ def test_each_engine_is_imported_in_one_file_of_the_simulators(heavy):
 
 
 def test_nothing_that_reads_scenes_or_rollouts_can_load_a_pickle():
-    # policies.py names pickle's error because a Stable-Baselines3 model, which is the user's own program, may hold one.
-    readers = {name: text for name, text in sources_of("avp_habitat").items() if name != "policies.py"}
+    # saved_model.py looks into the pickles that models of Stable-Baselines3 consist of before they are opened.
+    readers = {name: text for name, text in sources_of("avp_habitat").items() if name != "saved_model.py"}
     for name, source in readers.items():
         names = {module.split(".")[0] for module in imported(source)}
         assert not names & {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}, name

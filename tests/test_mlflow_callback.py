@@ -11,6 +11,7 @@ import pytest
 from mlflow import MlflowClient
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
 from tracking import BreakingEnv, SmallEnv, mlflow_home, ppo
 from tracking_server import free_port
 
@@ -21,7 +22,7 @@ from avp_habitat.tracking import deliver
 from avp_habitat.tracking.addresses import TrackingError
 from avp_habitat.tracking.remote import find_run
 from avp_sb3 import MetricsCallback, MLflowCallback
-from avp_sb3.run_facts import hyperparameters
+from avp_sb3.run_facts import hyperparameters, run_name
 
 TESTS = Path(__file__).parent
 
@@ -54,6 +55,25 @@ def test_a_training_can_be_read_back(client, tmp_path):
     assert steps == [64, 128]
     losses = client.get_metric_history(callback.run_id, "train/loss")
     assert [point.step for point in losses] == [128, 128]
+
+
+def test_runs_without_a_name_say_algorithm_reward_scene_and_seed(client):
+    names = []
+    for seed in (3, None, 4):
+        callback = MLflowCallback()
+        ppo(seed=seed).learn(64, callback=callback)
+        names.append(client.get_run(callback.run_id).info.run_name)
+    assert names == ["ppo proposed corridor seed 3", "ppo proposed corridor", "ppo proposed corridor seed 4"]
+
+
+def test_the_name_of_a_run_in_many_scenes_or_elsewhere_says_what_there_is():
+    def scene(name):
+        return type("Scene", (SmallEnv,), {"scene_name": name})
+
+    model = ppo(DummyVecEnv([scene(name) for name in ("a", "b", "a", "c")]))
+    assert run_name(model, model.get_env()) == "ppo proposed a and 2 more seed 3"
+    pole = DQN("MlpPolicy", "CartPole-v1", device="cpu", buffer_size=100)
+    assert run_name(pole, pole.get_env()) == "dqn CartPole-v1"
 
 
 def test_the_stored_model_loads_acts_and_names_its_run(client, tmp_path):
@@ -284,7 +304,7 @@ ppo(Ending()).learn(256, callback=[MetricsCallback(), MLflowCallback("exits", {s
         [sys.executable, "-c", script], env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True
     )
     assert done.returncode in (1, -signal.SIGINT), done.stderr
-    run_id = done.stdout.split("MLflow run ")[1].split()[0]
+    run_id = done.stdout.split("MLflow:   run ")[1].split()[0]
     assert client.get_run(run_id).info.status == status, done.stderr
     assert [point.step for point in client.get_metric_history(run_id, "avp/coverage")] == [64, 99]
 

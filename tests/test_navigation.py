@@ -249,10 +249,12 @@ def test_floor_height_is_the_meshs_not_the_voxels():
     ("parts", "message"),
     [
         ([WALLS], r"no floor.*Z-up"),
-        ([WALLS, quad((0, 0, 0), (4, 0, 0), (4, 0, 3), (0, 0, 3))], r"no floor.*wound the wrong way"),
         ([room(height=1.2)], r"ceiling lower than 1\.5 m"),
         ([room(0.05, 0.03, 0.04)], r"not in metres"),
-        ([room(42000, 2500, 31000)], r"millimetres"),
+        ([room(42000, 2500, 31000)], r"measures 42000 x 2500 x 31000 m .* millimetres"),
+        ([room(3e38, 3e38, 3e38)], r"measures 3e\+38 x .* expected at most 100000 m²"),
+        ([room(4, 3e38, 3)], r"measures 4 x 3e\+38 x 3 m"),
+        ([room(3e38, 2.5, 1e-38)], r"measures 3e\+38 x 2\.5 x "),
     ],
 )
 def test_mesh_without_room_for_an_agent_says_why(parts, message):

@@ -304,7 +304,7 @@ def test_a_damaged_picture_is_named_before_training(broken, path):
         parse(broken)
 
 
-def test_many_pictures_are_checked_byte_by_byte_only_when_asked_for(broken, monkeypatch):
+def test_many_pictures_are_checked_only_when_asked_for(broken, monkeypatch):
     # A held-out picture, because a few of the captured ones are decoded while parsing.
     damage(broken / "heldout/images/frame_00000.png")
     monkeypatch.setattr(verification, "AUTOMATIC_BYTES", 1000)
@@ -315,7 +315,7 @@ def test_many_pictures_are_checked_byte_by_byte_only_when_asked_for(broken, monk
     parse(broken, verify=False)
 
 
-def test_pictures_that_are_not_used_are_not_checked_byte_by_byte(broken):
+def test_pictures_that_are_not_used_are_not_checked(broken):
     damage(broken / "images/frame_00001.png")
     assert len(parse(broken, max_views=1).image_filenames) == 1
 
@@ -329,8 +329,10 @@ def test_a_picture_that_cannot_be_decoded_is_named(broken):
 def test_of_a_long_rollout_few_pictures_are_decoded_and_it_is_read_once_for_all_splits(tmp_path, monkeypatch):
     folder = write_room(tmp_path / "long", width=8, height=6, frames=3 * MOST_VIEWS)
     opened = []
-    monkeypatch.setattr(Image, "open", lambda path, real=Image.open: opened.append(path) or real(path))
-    parser = AVPDataParserConfig(data=folder).setup()
+    monkeypatch.setattr(
+        Image, "open", lambda path, real=Image.open, **options: opened.append(path) or real(path, **options)
+    )
+    parser = AVPDataParserConfig(data=folder, verify=False).setup()
     train = parser.get_dataparser_outputs("train")
     assert len(opened) == len(set(opened)) == 2 * MOST_VIEWS
     shutil.rmtree(folder)
@@ -348,7 +350,8 @@ def test_ten_thousand_frames_parse_in_three_seconds_of_work_and_little_memory(tm
     lengthened(write_room(tmp_path / "room", frames=5), folder, 10_000)
 
     def parse_both():
-        parser = AVPDataParserConfig(data=folder).setup()
+        # Of so many pictures of a usual size none but a few are decoded without being asked for.
+        parser = AVPDataParserConfig(data=folder, verify=False).setup()
         return [parser.get_dataparser_outputs(split) for split in ("train", "val")]
 
     parse(tmp_path / "room")  # the first cameras of a process make torch import for seconds

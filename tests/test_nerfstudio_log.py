@@ -233,7 +233,7 @@ def test_a_rollout_that_has_gone_is_named(copy, capsys):
     assert "- room\n" in text
     copy.write_text(text.replace("- room\n", "- gone\n"))
     assert log(copy, "--mlflow", "off") == 1
-    assert "gone: expected a rollout folder" in capsys.readouterr().err.splitlines()[-1]
+    assert "gone: expected the rollout of" in capsys.readouterr().err.splitlines()[-1]
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@ import itertools
 
 import numpy as np
 import pytest
-from corridor import Corridor
+from corridor import RayCorridor
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -27,7 +27,7 @@ NARROW = BeamSettings(width=50)
 
 @pytest.fixture(scope="module")
 def corridor():
-    return Corridor()
+    return RayCorridor()
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +112,7 @@ def test_visible_sets_of_the_lattice_follow_the_rule_of_the_task(corridor):
     points = corridor.area.centres
     everything = np.ones((len(sensor), len(points)), dtype=bool)
     pairs = candidates(sensor, task.intrinsics, points, everything, max_range_m=task.max_range_m)
-    reached = corridor.visible(sensor, points, pairs, tolerance_m=task.tolerance_m)
+    reached = corridor.visible(sensor, task.intrinsics, points, pairs, tolerance_m=task.tolerance_m)
     expected = np.zeros_like(everything)
     expected[tuple(pairs[reached].T)] = True
     assert len(np.unique(poses.pitch)) == 3

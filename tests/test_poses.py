@@ -4,6 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from avp_habitat import poses
+from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics
 
 ANGLE = st.floats(-3.1, 3.1)
@@ -99,10 +100,16 @@ def test_the_field_of_view_ends_at_the_image_border():
     assert (camera.fx, camera.cx, camera.cy) == (pytest.approx(320), 320, 240)
 
 
-@pytest.mark.parametrize("hfov_deg", [0, 180, -20])
+@pytest.mark.parametrize("hfov_deg", [0, 180, -20, float("nan"), float("inf"), "90"])
 def test_an_impossible_field_of_view_is_refused(hfov_deg):
-    with pytest.raises(ValueError, match=r"within \(0, 180\) degrees"):
+    with pytest.raises(UsageError, match=r"^hfov_deg: expected a number from 1 to 175, got"):
         Intrinsics.from_hfov(64, 48, hfov_deg=hfov_deg)
+
+
+@pytest.mark.parametrize("width", [0, 2.5, 10**9, -8, True, float("nan"), None])
+def test_an_impossible_image_size_is_refused(width):
+    with pytest.raises(UsageError, match=r"^width: expected a whole number from 1 to 16,384, got"):
+        Intrinsics.from_hfov(width, 48, hfov_deg=90)
 
 
 @pytest.mark.parametrize(

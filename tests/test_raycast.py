@@ -211,6 +211,15 @@ def test_a_texture_pinched_to_a_point_is_still_a_colour():
         assert (rgb == 77).all()
 
 
+@pytest.mark.parametrize("place", [np.nan, np.inf, -np.inf])
+def test_a_texture_at_no_place_at_all_is_not_read_beside_the_picture(place):
+    mesh = wall(np.full((8, 8, 3), 77, np.uint8))
+    uv = np.full((4, 2), place, np.float32)
+    nowhere = TexturedMesh(mesh.vertices, mesh.triangles, uv, mesh.colours, mesh.texture_index, mesh.textures)
+    frames = simulator(nowhere).render(facing([0, 0.5, 0]), Intrinsics(4, 4, 20.0, 20.0, 2.0, 2.0), rgb=True)
+    np.testing.assert_allclose(frames.depth, 1.0, atol=1e-5)
+
+
 def brute_force_nearest(origins, directions, mesh):
     """Smallest t > 0 at which each ray meets any triangle, by Cramer's rule in float64."""
     a, b, c = (mesh.vertices[mesh.triangles[:, i]].astype(np.float64) for i in range(3))
@@ -229,14 +238,14 @@ def brute_force_nearest(origins, directions, mesh):
 def test_visibility_and_depth_agree_with_brute_force(seed):
     rng = np.random.default_rng(seed)
     mesh = plain(rng.uniform(-2, 2, (60, 3)), np.arange(60).reshape(-1, 3))
-    cameras = camera_to_world(rng.uniform(-2, 2, (5, 3)), yaw=rng.uniform(-3, 3, 5), pitch=rng.uniform(-1, 1, 5))
+    eyes = rng.uniform(-2, 2, (5, 3))
     points = rng.uniform(-3, 3, (40, 3))
     pairs = rng.integers(0, [5, 40], (100, 2))
-    origin, offset = cameras[pairs[:, 0], :3, 3], points[pairs[:, 1]] - cameras[pairs[:, 0], :3, 3]
+    origin, offset = eyes[pairs[:, 0]], points[pairs[:, 1]] - eyes[pairs[:, 0]]
     distance = np.linalg.norm(offset, axis=1)
     nearest = brute_force_nearest(origin, offset / distance[:, None], mesh)
     clear = np.abs(nearest - (distance - 0.1)) > 1e-4
-    visible = simulator(mesh).visible(cameras, points, pairs, tolerance_m=0.1)
+    visible = simulator(mesh).reached(eyes, points, pairs, tolerance_m=0.1)
     assert 0 < visible.sum() < len(visible)
     assert np.array_equal(visible[clear], (nearest >= distance - 0.1)[clear])
 
@@ -245,12 +254,14 @@ def test_a_hit_within_the_tolerance_still_reaches_the_point():
     sim = simulator(wall(np.full((1, 1, 3), 90, np.uint8)))
     points = np.array([[0, 0.5, -1.09], [0, 0.5, -1.11], [0, 0.5, -0.5], [0, 0.5, -0.01], [0, 0.5, 0]])
     pairs = np.stack([np.zeros(5, int), np.arange(5)], axis=1)
-    reached = sim.visible(facing([0, 0.5, 0]), points, pairs, tolerance_m=0.1)
+    reached = sim.reached(np.array([[0, 0.5, 0]]), points, pairs, tolerance_m=0.1)
     assert reached.tolist() == [True, False, True, True, True]
 
 
 def test_no_pairs_give_no_answers(room):
-    assert room.visible(facing([0, 1, 0]), np.zeros((3, 3)), np.zeros((0, 2), int), tolerance_m=0.1).shape == (0,)
+    points, none = np.zeros((3, 3)), np.zeros((0, 2), int)
+    assert room.visible(facing([0, 1, 0]), CAMERA, points, none, tolerance_m=0.1).shape == (0,)
+    assert room.reached(np.zeros((1, 3)), points, none, tolerance_m=0.1).shape == (0,)
 
 
 def test_no_cameras_give_no_frames(room):

@@ -140,7 +140,7 @@ FORMS = {
     ),
     "python -m avp_habitat.doctor": Form(r"ok  simulator raycast(?s:.*)ok  plug AVP-v0", slow=True),
     "python -m avp_habitat.collect --simulator habitat --scene room.glb --policy frontier --out runs/h0": Form(
-        r"^runs/h0: 8 views|^error: .*habitat-sim is not installed.*conda install habitat-sim",
+        r"^runs/h0: 8 views|^error: .*habitat-sim is not installed.*build version 0.3.4 from its sources",
         {"--policy frontier": f"--policy frontier {PICTURES}"},
         codes=(0, 1),
         needs=("python -m avp_habitat.scenes.export",),

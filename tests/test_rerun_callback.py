@@ -70,7 +70,7 @@ def test_recording_passes_reruns_own_check(recorded):
 
 
 def test_recording_has_the_entities_of_the_layout(recorded):
-    parts = {"coverage", "surface", "spread", "step", "collision", "redundancy", "stop"}
+    parts = {"coverage", "spread", "step", "collision", "redundancy", "stop"}
     world = {"room", "floor", "path", "views", "agent", "camera", "camera/rgb", "camera/depth"}
     expected = {"/world", "/plots/coverage", "/plots/action", "/plots/reward/sum"}
     expected |= {f"/world/{name}" for name in world} | {f"/plots/reward/{name}" for name in parts}

@@ -2,11 +2,30 @@ import dataclasses
 
 import numpy as np
 import pytest
+from corridor import Corridor
 from hypothesis import given
 from hypothesis import strategies as st
+from rrd import rows
 
+from avp_habitat.env import AVPEnv
 from avp_habitat.errors import UsageError
-from avp_habitat.rewards import PARTS, REWARD_NAMES, RewardConstants, StepFacts, has_stop, reward_parts, stops_episode
+from avp_habitat.poses import Intrinsics
+from avp_habitat.rewards import (
+    REWARD_NAMES,
+    REWARDS,
+    RewardConstants,
+    StepFacts,
+    has_stop,
+    reward_parts,
+    stops_episode,
+)
+from avp_habitat.rollout_capture import capture_step, publish_rollout
+from avp_habitat.rollout_writer import RolloutWriter
+from avp_habitat.settings import TaskSettings
+from avp_sb3 import AVPVecEnv
+from avp_sb3.metrics_callback import EpisodeWindow
+from avp_sb3.rerun_recording import write_rollout_recording
+from avp_sb3.rerun_steps import Steps
 
 # All different and none a special value, so that a swapped or forgotten constant changes a sum.
 CONSTANTS = RewardConstants(
@@ -50,12 +69,11 @@ def by_hand(name, facts, i):
     collision = -c.collision if facts.collided[i] else 0.0
     spread = c.spread * min(float(facts.spread_m[i]), c.spread_limit_m)
     redundancy = -c.redundancy if facts.redundant[i] else 0.0
-    parts = dict.fromkeys(PARTS, 0.0)
     if name == "coverage":
-        return parts | {"coverage": c.alpha * int(facts.new_cells[i]), "collision": collision}
+        return {"coverage": c.alpha * int(facts.new_cells[i]), "collision": collision}
     if name == "coverage_redundancy":
         linear = c.alpha * int(facts.new_cells[i])
-        return parts | {"coverage": linear, "collision": collision, "spread": spread, "redundancy": redundancy}
+        return {"coverage": linear, "collision": collision, "spread": spread, "redundancy": redundancy}
     stop = 0.0
     if facts.stop_chosen[i]:
         enough = facts.coverage[i] >= c.stop_coverage
@@ -65,17 +83,7 @@ def by_hand(name, facts, i):
         new = {"surface": c.alpha_surface / discount * float(facts.new_surface[i]) ** c.beta}
     else:
         new = {"coverage": c.alpha_proposed / discount * int(facts.new_cells[i]) ** c.beta}
-    return (
-        parts
-        | new
-        | {
-            "spread": spread,
-            "step": -c.step,
-            "collision": collision,
-            "redundancy": redundancy,
-            "stop": stop,
-        }
-    )
+    return new | {"spread": spread, "step": -c.step, "collision": collision, "redundancy": redundancy, "stop": stop}
 
 
 @pytest.mark.parametrize("name", REWARD_NAMES)
@@ -83,11 +91,9 @@ def by_hand(name, facts, i):
 def test_every_part_equals_the_formula_by_hand(name, seed):
     facts = random_facts(seed)
     parts = reward_parts(name, facts, CONSTANTS)
-    assert tuple(parts) == PARTS
     for i in range(len(facts.coverage)):
         expected = by_hand(name, facts, i)
-        for part in PARTS:
-            assert parts[part][i] == pytest.approx(expected[part]), (name, part)
+        assert {part: values[i] for part, values in parts.items()} == pytest.approx(expected)
 
 
 def test_only_the_proposed_and_the_surface_reward_have_a_stop():
@@ -111,3 +117,84 @@ def test_the_default_constants_follow_the_design():
 def test_an_unknown_reward_names_the_nearest():
     with pytest.raises(UsageError, match=r"unknown reward 'covrage': .* did you mean 'coverage'"):
         reward_parts("covrage", random_facts(0), CONSTANTS)
+
+
+def of_ones_own(facts, constants):
+    """Parts under names that no reward of the suite has: one for all agents, and one that some steps leave out."""
+    parts = {"look, around": 0.1 * facts.new_cells, "time": -0.25}
+    return parts | ({"blocked/twice": -2.0 * facts.collided} if facts.collided.any() else {})
+
+
+@pytest.fixture
+def own_reward(monkeypatch):
+    monkeypatch.setitem(REWARDS, "own", of_ones_own)
+    return TaskSettings(reward="own", budget=12, width=16, height=12)
+
+
+WALK_INTO_A_WALL = [0] * 11 + [1]
+
+
+def test_a_reward_is_the_sum_of_what_its_function_returns(own_reward):
+    env = AVPEnv(simulator=Corridor(), settings=own_reward)
+    env.reset(seed=4)
+    for action in WALK_INTO_A_WALL:
+        _, reward, _, _, info = env.step(action)
+        expected = 0.1 * info["new_cells"] - 0.25 - 2.0 * info["collided"]
+        assert reward == pytest.approx(expected)
+        assert sum(info["reward_parts"].values()) == pytest.approx(expected)
+    trajectory, figures = info["avp_trajectory"], info["avp_episode"]
+    assert trajectory.collided.any()
+    assert figures["return_blocked/twice"] == -2.0 * figures["collisions"]
+    assert figures["return_time"] == pytest.approx(-0.25 * 12)
+    np.testing.assert_allclose(sum(trajectory.reward_parts.values()), trajectory.reward)
+
+
+def test_agents_of_a_batch_have_the_same_parts_as_one_alone(own_reward):
+    batch = AVPVecEnv(simulator=Corridor(), agents=3, settings=own_reward, seed=4)
+    batch.reset()
+    sums = np.zeros(3)
+    for action in WALK_INTO_A_WALL:
+        _, rewards, dones, infos = batch.step(np.full(3, action))
+        sums += rewards
+    assert dones.all()
+    for total, info in zip(sums, infos, strict=True):
+        returns = {name: value for name, value in info["avp_episode"].items() if name.startswith("return_")}
+        assert sum(returns.values()) == pytest.approx(total, abs=1e-5)
+
+
+def test_a_rollout_holds_the_parts_by_their_names_also_those_of_later_steps_only(own_reward, tmp_path):
+    env = AVPEnv(simulator=Corridor(), settings=own_reward)
+    camera = Intrinsics.from_hfov(24, 16, hfov_deg=90)
+    env.reset(seed=4)
+    with RolloutWriter(tmp_path / "r", camera) as writer:
+        for action in WALK_INTO_A_WALL:
+            _, reward, _, _, info = env.step(action)
+            capture_step(env, writer, action, reward, info)
+        publish_rollout(env, writer, info, policy={"name": "a list"}, seed=0, heldout=0)
+    plots = Steps(tmp_path / "r" / "steps.csv", frames=12).plots()
+    parts = {name.removeprefix("reward/"): values for name, values in plots.items() if name.startswith("reward/")}
+    total = parts.pop("sum")
+    assert set(parts) == {"look, around", "time", "blocked/twice"}
+    np.testing.assert_allclose(sum(parts.values()), total, atol=1e-6)
+    assert parts["blocked/twice"][0] == 0
+    rrd = write_rollout_recording([tmp_path / "r"], tmp_path / "r.rrd")
+    recorded = rows(rrd, "/r/plots/reward/blocked/twice", "Scalars:scalars")
+    assert np.concatenate([value for _, value in recorded]).tolist() == parts["blocked/twice"].tolist()
+    assert rows(rrd, r"/r/plots/reward/look\,\ around", "Scalars:scalars")
+
+
+def test_metrics_of_a_training_hold_each_part_also_one_that_shows_up_later(own_reward):
+    window = EpisodeWindow(4)
+    first = {"coverage": 0.5, "views": 4.0, "annd_m": 0.2, "ei": 0.1, "stopped": 0.0, "collisions": 0.0}
+    first |= {"redundant_views": 0.0, "return_time": -1.0}
+    window.add(first)
+    window.add(first | {"return_blocked/twice": -6.0})
+    means = window.means()
+    assert means["reward/blocked/twice"] == pytest.approx(-3.0)
+    assert means["reward/time"] == pytest.approx(-1.0)
+
+
+def test_a_part_that_is_no_number_for_each_agent_is_named(monkeypatch):
+    monkeypatch.setitem(REWARDS, "own", lambda facts, constants: {"pair": np.zeros((6, 2))})
+    with pytest.raises(UsageError, match=r"own: part 'pair': expected one number for each of 6 agents, got .*\(6, 2\)"):
+        reward_parts("own", random_facts(0), CONSTANTS)

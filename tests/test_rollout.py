@@ -121,6 +121,7 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing(tmp_path):
         # /dev/full fails every write with ENOSPC, as a full disk does.
         (writer.path("images") / "frame_00001.png").symlink_to("/dev/full")
         writer.add_frame(np.zeros((8, 12, 3), dtype=np.uint8), np.ones((8, 12)), some_poses(1)[0])
+        writer.publish({})
 
     with pytest.raises(RolloutError, match="cannot write there: No space left"):
         break_off(tmp_path / "r", fill)
@@ -179,11 +180,21 @@ def resize(folder, name, size, mode):
     Image.new(mode, size).save(folder / name)
 
 
-def link_out(folder, name):
-    outside = folder.parent / "outside"
-    outside.write_bytes((folder / name).read_bytes())
-    (folder / name).unlink()
-    (folder / name).symlink_to(outside)
+def link_out(folder, name, *, missing=False):
+    """The file moves to a store that lies outside of the rollout, and a link stays."""
+    store = folder.parent / "store"
+    store.mkdir(exist_ok=True)
+    target = store / name.replace("/", "-")
+    shutil.move(folder / name, target)
+    (folder / name).symlink_to(target)
+    if missing:
+        target.unlink()
+
+
+def floor_file(folder, name):
+    meta = json.loads((folder / "rollout.json").read_text())
+    meta["floor"]["file"] = name
+    (folder / "rollout.json").write_text(json.dumps(meta))
 
 
 def cut_short(folder, name):
@@ -219,7 +230,7 @@ DAMAGES = {
     ),
     "NaN focal length": (
         lambda f: edit_json(f / "rollout.json", lambda j: j["camera"].update(fx=float("nan"))),
-        "camera.fx to be a number of pixels above 0, found nan",
+        "camera.fx to be a finite number, found nan",
     ),
     "no width": (lambda f: edit_json(f / "rollout.json", lambda j: j["camera"].pop("width")), "camera.width"),
     "wrong count": (
@@ -266,21 +277,26 @@ DAMAGES = {
     ),
     "a size beyond all numbers": (
         lambda f: edit_json(f / "rollout.json", lambda j: j["camera"].update(fx=10**400)),
-        "camera.fx to be a number of pixels",
+        "camera.fx to be a finite number, found 1000",
     ),
     "nested without end": (lambda f: (f / "rollout.json").write_text("[" * 100_000), "rollout.json: expected JSON"),
     "image cut short": (lambda f: cut_short(f, "images/frame_00002.png"), "frame_00002.png: .* without an end"),
     "depth cut short": (lambda f: cut_short(f, "heldout/depth/frame_00001.png"), "frame_00001.png: .* without an end"),
     "image is a folder": (lambda f: replace_by_folder(f, "images/frame_00001.png"), "frame_00001.png: expected a file"),
     "image leads to itself": (lambda f: link_to_itself(f, "images/frame_00001.png"), "link that leads to itself"),
-    "image outside": (lambda f: link_out(f, "images/frame_00001.png"), "expected a path inside"),
-    "pose outside": (lambda f: link_out(f, "poses/frame_00000.txt"), "expected a path inside"),
+    "image not fetched": (lambda f: link_out(f, "images/frame_00001.png", missing=True), "link to .*which is missing"),
+    "pose not fetched": (lambda f: link_out(f, "poses/frame_00000.txt", missing=True), "link to .*which is missing"),
     "no floor": (lambda f: (f / "floor.png").unlink(), "floor.png: expected a 16-bit grey PNG, could not read it"),
     "floor is text": (
         lambda f: edit_json(f / "rollout.json", lambda j: j.update(floor="floor.png")),
         "floor.file to be the name of a file, found None",
     ),
-    "floor outside": (lambda f: link_out(f, "floor.png"), "floor.png: expected a path inside"),
+    "floor not fetched": (
+        lambda f: link_out(f, "floor.png", missing=True),
+        r"floor\.png: .*link to .*which is missing",
+    ),
+    "floor outside": (lambda f: floor_file(f, "../floor.png"), r"\.\./floor\.png: expected a path inside"),
+    "floor absolute": (lambda f: floor_file(f, "/etc/hostname"), r"/etc/hostname: expected a path inside"),
     "floor elsewhere": (
         lambda f: edit_json(f / "rollout.json", lambda j: j["floor"].update(file="../floor.png")),
         r"\.\./floor.png: expected a path inside",
@@ -298,13 +314,13 @@ DAMAGES = {
     ),
     "floor nowhere": (
         lambda f: edit_json(f / "rollout.json", lambda j: j["floor"].update(origin_m=[0, float("nan")])),
-        "floor.origin_m to be x and z in metres",
+        r"floor.origin_m\[1\] to be a finite number, found nan",
     ),
     "floor of no cells": (
         lambda f: edit_json(f / "rollout.json", lambda j: j["floor"].update(cell_m=0)),
         "floor.cell_m to be metres above 0, found 0",
     ),
-    "rollout.json outside": (lambda f: link_out(f, "rollout.json"), "expected a path inside"),
+    "rollout.json not fetched": (lambda f: link_out(f, "rollout.json", missing=True), "link to .*which is missing"),
 }
 
 
@@ -324,9 +340,12 @@ def test_the_first_of_several_bad_poses_is_named(rollout):
         read_rollout(rollout)
 
 
-def test_links_within_the_folder_are_followed(rollout):
+def test_links_are_followed_within_the_folder_and_into_a_store(rollout):
     (rollout / "images/frame_00001.png").unlink()
     (rollout / "images/frame_00001.png").symlink_to(rollout / "images/frame_00000.png")
+    for name in ("rollout.json", "floor.png", "depth/frame_00001.png", "poses/frame_00000.txt", "steps.csv"):
+        link_out(rollout, name)
+    link_out(rollout, "heldout")
     assert len(read_rollout(rollout).frames) == FRAMES
 
 

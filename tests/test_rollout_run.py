@@ -68,7 +68,7 @@ def policy_run(client, experiment="policies"):
 def test_a_rollout_is_a_finished_run_with_its_figures_settings_origin_and_files(rollout, store):
     run = store.get_run(rollout_run(store, rollout))
     meta = json.loads((rollout / "rollout.json").read_text())
-    assert (run.info.status, run.info.run_name) == ("FINISHED", "rollout random builtin:0")
+    assert (run.info.status, run.info.run_name) == ("FINISHED", f"rollout random builtin:0 seed {meta['seed']}")
     assert store.get_experiment(run.info.experiment_id).name == "avp"
     written = {f"eval/{name}": value for name, value in meta["metrics"].items()}
     cpv = 100 * meta["metrics"]["coverage"] / 4
@@ -102,11 +102,23 @@ def test_a_copy_elsewhere_is_the_same_rollout_and_another_episode_is_not(rollout
 
 def test_the_run_is_a_child_of_the_run_that_trained_the_policy_in_its_experiment(rollout, store):
     policy = policy_run(store)
-    tell(rollout, mlflow_run_id=policy, policy={"name": "model.zip"})
+    tell(rollout, mlflow_run_id=policy, policy={"name": "model.zip"}, reward="coverage", seed=7)
     run = store.get_run(rollout_run(store, rollout, experiment="ignored"))
     assert run.info.experiment_id == store.get_run(policy).info.experiment_id
     assert run.data.tags["mlflow.parentRunId"] == run.data.tags["avp.policy_run"] == policy
-    assert run.info.run_name == "rollout model.zip builtin:0"
+    assert run.info.run_name == "rollout model.zip coverage builtin:0 seed 7"
+
+
+def test_without_a_policys_run_mlflows_variable_names_the_experiment(rollout, store, monkeypatch):
+    monkeypatch.setenv("MLFLOW_EXPERIMENT_NAME", "mine")
+    run = store.get_run(rollout_run(store, rollout))
+    assert store.get_experiment(run.info.experiment_id).name == "mine"
+
+
+def test_a_deleted_experiment_is_named_before_a_run_is_made(rollout, store):
+    store.delete_experiment(store.create_experiment("gone"))
+    with pytest.raises(TrackingError, match=r"MLflow experiment 'gone' at .* is deleted; .*mlflow experiments restore"):
+        rollout_run(store, rollout, experiment="gone")
 
 
 def test_a_policy_run_that_the_store_does_not_have_is_named_only(rollout, store):

@@ -261,11 +261,22 @@ def test_damaged_json_is_a_scene_error(tmp_path, name, content, message):
         locate(str(tmp_path / name))
 
 
-def test_a_link_does_not_lead_out_of_the_data(tmp_path):
+def test_of_a_stage_the_path_counts_as_it_is_written_not_where_a_link_leads(tmp_path):
     path = stage(tmp_path / "a/b")
-    shutil.move(tmp_path / "a/b/mesh.ply", tmp_path / "mesh.ply")
-    os.symlink(tmp_path / "mesh.ply", tmp_path / "a/b/mesh.ply")
-    with pytest.raises(SceneError, match=r"'mesh.ply' lies outside of"):
+    shutil.move(tmp_path / "a/b/mesh.ply", tmp_path / "blob")
+    os.symlink(tmp_path / "blob", tmp_path / "a/b/mesh.ply")
+    assert locate(str(path)).asset == tmp_path / "a/b/mesh.ply"
+    (tmp_path / "blob").unlink()
+    with pytest.raises(SceneError, match=r"render_asset: is a link to .*blob, where there is no file; fetch it"):
+        locate(str(path))
+
+
+def test_no_link_helps_a_stage_out_of_its_data(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    shutil.copy(stage(tmp_path / "x").with_name("mesh.ply"), tmp_path / "mesh.ply")
+    path = stage(tmp_path / "a/b", render_asset="link/../../../mesh.ply")
+    os.symlink(tmp_path / "elsewhere", tmp_path / "a/b/link")
+    with pytest.raises(SceneError, match=r"mesh.ply' lies outside of"):
         locate(str(path))
 
 
@@ -420,12 +431,11 @@ def _with_scenes(folder: Path, cells: dict) -> str:
     return f"{dataset(folder, **cells)}:flat"
 
 
-def test_a_search_path_does_not_follow_a_link_out_of_the_dataset(tmp_path):
+def test_a_search_path_follows_a_link(tmp_path):
     path = dataset(tmp_path / "data")
-    stage(tmp_path / "elsewhere")
-    os.symlink(tmp_path / "elsewhere", tmp_path / "data/a/link")
-    with pytest.raises(SceneError, match=r"stages.paths..json: 'a/link' lies outside of"):
-        locate(f"{path}:hall")
+    shutil.move(tmp_path / "data/a/stages", tmp_path / "elsewhere")
+    os.symlink(tmp_path / "elsewhere", tmp_path / "data/a/stages")
+    assert locate(f"{path}:hall").asset == tmp_path / "data/a/stages/mesh.ply"
 
 
 def test_a_missing_id_brings_the_names(tmp_path):

@@ -2,6 +2,7 @@ import base64
 import hashlib
 import io
 import json
+import resource
 import struct
 from pathlib import Path
 
@@ -121,6 +122,27 @@ def test_nested_nodes_apply_scale_then_rotation_then_translation_then_the_parent
     np.testing.assert_allclose(load_scene(document.write(tmp_path)).mesh.vertices[3], expected, atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        [{"mesh": 0, "scale": [-1, 1, 1]}],
+        [{"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -2, 0, 3, 4, 5, 1]}],
+        [{"scale": [1, -1, 1], "children": [1]}, {"mesh": 0, "rotation": [0, 0.6, 0, 0.8]}],
+    ],
+    ids=["scale", "matrix", "parent"],
+)
+def test_a_mirroring_node_turns_the_winding_over(tmp_path, nodes):
+    """What was counter-clockwise seen from the front stays so (glTF 2.0, section 3.7.4)."""
+    mesh = load_scene(quad(nodes=nodes, scenes=[{"nodes": [0]}]).write(tmp_path)).mesh
+    assert mesh.triangles.tolist() == [[2, 1, 0], [3, 1, 2]]
+
+
+def test_two_mirrors_leave_the_winding(tmp_path):
+    nodes = [{"scale": [-1, 1, 1], "children": [1]}, {"mesh": 0, "scale": [1, 1, -3]}]
+    mesh = load_scene(quad(nodes=nodes, scenes=[{"nodes": [0]}]).write(tmp_path)).mesh
+    assert mesh.triangles.tolist() == [[0, 1, 2], [2, 1, 3]]
+
+
 def test_only_the_default_scene_is_read_and_a_mesh_may_be_used_twice(tmp_path):
     nodes = [{"mesh": 0, "translation": [9, 9, 9]}, {"mesh": 0}, {"mesh": 0, "translation": [0, 0, 5]}]
     document = quad(nodes=nodes, scenes=[{"nodes": [0]}, {"nodes": [1, 2]}], scene=1)
@@ -196,6 +218,70 @@ def test_a_picture_outside_the_folder_is_refused(tmp_path):
         load_scene(spec)
 
 
+def in_store(folder: Path, layout: str) -> Path:
+    """The scene's two files as links into a store: beside the folder, as absolute paths, or the folder itself."""
+    scene, store = folder / "snapshots/x", folder / "blobs"
+    scene.mkdir(parents=True)
+    document = with_picture(quad(), {"uri": "red.png"})
+    document.write(scene)
+    (scene / "red.png").write_bytes(png(PICTURE))
+    store.mkdir()
+    for number, name in enumerate(("scene.gltf", "red.png")):
+        (scene / name).rename(store / f"{number}")
+        base = store if layout == "absolute" else Path("../../blobs")
+        (scene / name).symlink_to(base / f"{number}")
+    if layout == "folder":
+        (folder / "room").symlink_to(scene)
+        return folder / "room/scene.gltf"
+    return scene / "scene.gltf"
+
+
+@pytest.mark.parametrize("layout", ["relative", "absolute", "folder"])
+def test_a_scene_of_links_into_a_store_opens(tmp_path, layout):
+    path = in_store(tmp_path, layout)
+    assert np.array_equal(load_scene(str(path)).mesh.textures[0], PICTURE)
+
+
+def test_a_scene_is_found_from_within_a_folder_that_is_a_link(tmp_path, monkeypatch):
+    monkeypatch.chdir(in_store(tmp_path, "folder").parent)
+    assert load_scene("scene.gltf").name == "scene.gltf"
+
+
+@pytest.mark.parametrize("uri", ["../red.png", "link/../../red.png", "/red.png"])
+def test_no_link_helps_a_picture_out_of_the_folder(tmp_path, uri):
+    (tmp_path / "a/b").mkdir(parents=True)
+    (tmp_path / "a/b/link").symlink_to(tmp_path)
+    (tmp_path / "a/red.png").write_bytes(png(PICTURE))
+    path = with_picture(quad(), {"uri": uri}).write(tmp_path / "a/b")
+    with pytest.raises(SceneError, match=rf"refers to '{uri}', which lies outside the folder of the scene"):
+        load_scene(path)
+
+
+@pytest.mark.parametrize("name", ["scene.gltf", "red.png"])
+def test_a_link_whose_content_was_not_fetched_says_so(tmp_path, name):
+    path = in_store(tmp_path, "relative")
+    (path.parent / name).resolve().unlink()
+    with pytest.raises(
+        SceneError, match=rf"{name}.*: is a link to \.\./\.\./blobs/\d, where there is no file; fetch it"
+    ):
+        load_scene(str(path))
+
+
+def test_two_links_to_one_file_are_two_scenes(tmp_path):
+    from avp_habitat.simulators import make_simulator
+
+    path = export_room(tmp_path / "store.glb")
+    for name in ("a.glb", "b.glb"):
+        (tmp_path / name).symlink_to(path)
+    first, second = (make_simulator("raycast", str(tmp_path / name)) for name in ("a.glb", "b.glb"))
+    assert (first.scene, second.scene) == ("a.glb", "b.glb")
+
+
+def export_room(path: Path) -> Path:
+    export.export_glb(wedge(), path)
+    return path
+
+
 def test_a_picture_that_cannot_be_decoded_is_named(tmp_path):
     spec = with_picture(quad(), {"uri": data_uri(png(PICTURE)[:50])}).write(tmp_path)
     with pytest.raises(SceneError, match=r"scene.gltf: image 0: the picture cannot be decoded"):
@@ -233,6 +319,64 @@ def test_a_damaged_gltf_is_a_scene_error(tmp_path, change, message):
     change(document.json)
     with pytest.raises(SceneError, match=message):
         load_scene(document.write(tmp_path))
+
+
+def sparse(count: int) -> Gltf:
+    """A quad whose accessor of positions has no data but four sparse values, and says to be longer."""
+    document = Gltf()
+    view = document.view
+    entry = {"indices": {"bufferView": view(np.arange(4, dtype="<u2").tobytes()), "componentType": 5123}, "count": 4}
+    entry["values"] = {"bufferView": view(POSITIONS.tobytes())}
+    document.json["accessors"].append({"componentType": 5126, "type": "VEC3", "count": count, "sparse": entry})
+    document.mesh({"POSITION": 0}, indices=document.accessor(np.array([0, 1, 2], "<u2")))
+    return document
+
+
+def copies(count: int) -> Gltf:
+    """Nodes that all show one mesh of fifty thousand triangles."""
+    document = quad(indices=[0, 1, 2] * 50_000, nodes=[{"mesh": 0}] * count, scenes=[{"nodes": list(range(count))}])
+    return document
+
+
+def claim(count: int, **extra) -> Gltf:
+    document = quad()
+    document.json["accessors"][0] |= {"count": count}
+    document.json["bufferViews"][0] |= extra
+    return document
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        (sparse(10**6), r"accessor 0 claims 1000000 elements without any data .* buffers hold 64 bytes"),
+        (sparse(10**9), r"its mesh takes 160\.0 GB of memory, of which 1\.0 GB are free"),
+        (sparse(10**30), r"its mesh takes .* GB of memory, of which"),
+        (copies(1_000), r"its mesh takes 4\.5 GB of memory, of which 1\.0 GB are free"),
+        (claim(10**6), r"truncated: accessor 0 needs 1000000 elements"),
+        (claim(10**6, byteStride=4), r"truncated: accessor 0 needs 1000000 elements"),
+        (claim(5, byteLength=10**10), r"truncated: buffer view 0 ends at byte 10000000000"),
+    ],
+    ids=["sparse", "sparse beyond memory", "sparse beyond numbers", "copies", "count", "stride", "view"],
+)
+def test_sizes_are_checked_before_memory_is_taken(tmp_path, monkeypatch, document, message):
+    path = document.write(tmp_path)
+    monkeypatch.setattr(Path, "read_text", lambda _: "MemTotal:  9 kB\nMemAvailable:  1000000 kB\n")
+    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(SceneError, match=message):
+        load_scene(path)
+    # In kilobytes.
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - used < 500_000
+
+
+def test_a_sparse_accessor_without_base_is_read(tmp_path):
+    assert np.array_equal(load_scene(sparse(4).write(tmp_path)).mesh.vertices, POSITIONS)
+
+
+def test_a_picture_larger_than_memory_is_refused(tmp_path, monkeypatch):
+    path = with_picture(quad(), {"uri": data_uri(png(np.zeros((200, 300, 3), np.uint8)))}).write(tmp_path)
+    monkeypatch.setattr(Path, "read_text", lambda _: "MemAvailable:      100 kB")
+    with pytest.raises(SceneError, match=r"image 0: its picture of 300 x 200 pixels takes"):
+        load_scene(path)
 
 
 def test_a_triangle_of_a_vertex_that_does_not_exist_is_refused(tmp_path):

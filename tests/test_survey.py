@@ -30,8 +30,9 @@ def share_of_surfaces_seen(env, policy):
         done = terminated or truncated
         view = agent_views(env)[0]
         pose = sensor_poses(env.settings, view.position[None], np.array([view.yaw]), np.array([view.pitch]))
-        pairs = candidates(pose, env.settings.intrinsics, points, ~seen[None], max_range_m=10.0)
-        seen[pairs[env.simulator.visible(pose, points, pairs, tolerance_m=0.1), 1]] = True
+        camera = env.settings.intrinsics
+        pairs = candidates(pose, camera, points, ~seen[None], max_range_m=10.0)
+        seen[pairs[env.simulator.visible(pose, camera, points, pairs, tolerance_m=0.1), 1]] = True
     return seen.mean(), info["coverage"]
 
 

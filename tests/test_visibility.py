@@ -103,7 +103,7 @@ def test_in_the_corridor_they_agree_at_any_resolution(width, height, least):
     pixel, planar = poses.project(points.xyz, np.stack(frames), camera)
     inside = (planar > 0) & (pixel >= 0).all(axis=-1) & (pixel < [width, height]).all(axis=-1)
     pairs = np.argwhere(inside)
-    by_rays = CORRIDOR.visible(np.stack(frames), points.xyz, pairs, tolerance_m=0.01)
+    by_rays = CORRIDOR.visible(np.stack(frames), camera, points.xyz, pairs, tolerance_m=0.01)
     found = np.zeros_like(inside)
     for index, (picture, pose) in enumerate(depth):
         found[index, points_seen(picture, pose, camera, points.xyz)] = True
@@ -315,7 +315,7 @@ def test_the_rollout_agrees_with_rays_in_its_room(rollout, room):
     points = heldout_points(views, found.intrinsics, stride=grid_stride(found.intrinsics)).xyz
     pixel, planar = poses.project(points, poses_of, found.intrinsics)
     pairs = np.argwhere((planar > 0) & (pixel >= 0).all(axis=-1) & (pixel < [160, 120]).all(axis=-1))
-    reached = room.visible(poses_of, points, pairs, tolerance_m=0.01)
+    reached = room.visible(poses_of, found.intrinsics, points, pairs, tolerance_m=0.01)
     by_rays = np.zeros(len(points), bool)
     by_rays[pairs[reached, 1]] = True
     assert np.mean((answer.count >= 1) == by_rays) >= 0.98
@@ -372,5 +372,5 @@ def test_a_damaged_depth_picture_is_named(rollout, tmp_path):
     content[200:260] = bytes(60)
     path.write_bytes(content)
     broken = type(found.frames[0])(found.frames[0].image, path, found.frames[0].camera_to_world)
-    with pytest.raises(RolloutError, match=r"frame_00000\.png: expected a PNG with depth, could not decode it"):
+    with pytest.raises(RolloutError, match=r"frame_00000\.png: expected a readable PNG, could not decode it"):
         visibility_of([broken], found.heldout, found.intrinsics)

@@ -54,6 +54,7 @@ def mlflow_home(folder, monkeypatch):
     (folder / "mlflow.db").write_bytes(_empty_database())
     monkeypatch.chdir(folder)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
-    monkeypatch.delenv("AVP_MLFLOW_SPOOL", raising=False)
+    for name in ("AVP_MLFLOW_SPOOL", "MLFLOW_EXPERIMENT_NAME", "MLFLOW_EXPERIMENT_ID"):
+        monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     return uri

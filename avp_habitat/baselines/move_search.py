@@ -3,12 +3,12 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from avp_habitat.baselines.known_map import FREE, OBSERVED
 from avp_habitat.baselines.routes import walkable
 from avp_habitat.baselines.sight import Lens, clear_line, in_frame
+from avp_habitat.compiled import njit
 from avp_habitat.settings import MOVE_FORWARD, TURN_LEFT, TURN_RIGHT
 
 _MOST_PLACES = 600

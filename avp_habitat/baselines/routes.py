@@ -3,8 +3,9 @@
 import heapq
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from avp_habitat.compiled import njit
 
 
 def shortest_walks(

@@ -3,10 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from avp_habitat.agent_view import AgentView
 from avp_habitat.baselines.known_map import BLOCKED, BODY_M
+from avp_habitat.compiled import njit
 from avp_habitat.settings import TaskSettings
 
 

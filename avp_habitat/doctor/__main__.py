@@ -47,6 +47,7 @@ def all_checks() -> list[Check]:
     return [
         Check("Python", packages.check_python, 0.0),
         Check("packages", packages.check_packages, 0.0),
+        Check("numba", simulators.check_compiled, 2.0),
         Check("raycast", simulators.check_raycast, 5.0),
         Check("habitat", simulators.check_habitat, 7.0),
         Check("graphics", simulators.check_graphics, 0.3),

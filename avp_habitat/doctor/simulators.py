@@ -1,4 +1,4 @@
-"""Whether the simulators, the graphics device and PyTorch's CUDA run here; each is really tried."""
+"""Whether the simulators, compiled code, the graphics device and PyTorch's CUDA run here; each is really tried."""
 
 import os
 from pathlib import Path
@@ -13,6 +13,9 @@ from avp_habitat.versions import version_of
 LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"
 _OPEN_LIMIT_S = 120.0
 _TORCH_LIMIT_S = 60.0
+_COMPILED_LIMIT_S = 60.0
+# One of the suite's kernels stands for all.
+_COMPILED = "import json; from avp_habitat.map_kernel import draw as f; print(json.dumps(f.stats.cache_path))"
 _TORCH = (
     "import json, torch; there = torch.cuda.is_available(); "
     "print(json.dumps([torch.__version__, torch.version.cuda, torch.cuda.get_device_name() if there else None]))"
@@ -63,6 +66,18 @@ def check_graphics() -> list[Finding]:
     return [Finding(OK, "graphics (EGL)", f"--gpu takes {gpu}: {kind}, {renderer}{also}")]
 
 
+def check_compiled() -> list[Finding]:
+    """Where Numba keeps the suite's compiled kernels; without any place each program compiles them again."""
+    subject = "compiled code"
+    answer = ask(["-c", _COMPILED], time_limit_s=_COMPILED_LIMIT_S)
+    if answer.failure is not None:
+        return [Finding(BROKEN, subject, f"{answer.failure}; pip install --force-reinstall numba")]
+    if answer.value is None:
+        text = "cannot be kept, so that each program compiles for half a minute; name a folder in NUMBA_CACHE_DIR"
+        return [Finding(ABSENT, subject, text)]
+    return [Finding(OK, subject, f"kept in {answer.value}; NUMBA_CACHE_DIR names another folder")]
+
+
 def check_cuda() -> list[Finding]:
     """PyTorch's CUDA, which nerfstudio wants; the suite and PPO run without."""
     subject = "CUDA for torch"
@@ -82,8 +97,8 @@ def check_cuda() -> list[Finding]:
 
 def check_lpips() -> list[Finding]:
     """AlexNet's weights, without which a reconstruction's LPIPS needs the network."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    home = Path(os.environ.get("TORCH_HOME") or cache / "torch").expanduser()
+    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    home = Path(os.path.expanduser(os.environ.get("TORCH_HOME") or f"{cache}/torch"))
     path = home / "hub" / "checkpoints" / LPIPS_WEIGHTS
     if path.is_file():
         return [Finding(OK, "LPIPS weights", str(path))]

@@ -1,7 +1,8 @@
 """Looking views up in a scene's tables, compiled, for many agents at a time."""
 
 import numpy as np
-from numba import njit
+
+from avp_habitat.compiled import njit
 
 ONE = np.uint64(1)
 

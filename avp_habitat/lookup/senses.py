@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import UsageError
 from avp_habitat.lookup import kernels, panorama
+from avp_habitat.lookup.sight import single_rays
 from avp_habitat.lookup.tables import scene_tables
 from avp_habitat.senses import Float, Perception, Views, centre_depth
 from avp_habitat.settings import TaskSettings
@@ -28,9 +29,9 @@ class TableSenses:
                 f"lookup: the tables know coverage_mode 'visible' only, got {settings.coverage_mode!r}; "
                 "leave lookup off for it"
             )
-        self._simulator = simulator
+        self._simulator = single_rays(simulator, "lookup")
         self._settings = settings
-        self._tables = scene_tables(simulator, settings)
+        self._tables = scene_tables(self._simulator, settings)
         self._lowest = self._tables.key.pitches[0]
         self._centres = np.ascontiguousarray(simulator.area.centres)
         camera = settings.intrinsics
@@ -53,9 +54,8 @@ class TableSenses:
         found = np.zeros(len(slots), dtype=np.int64)
         pairs = self._sure_cells(views, slots, first_seen, rows, steps, found)
         if len(pairs):
-            reached = self._simulator.visible(
-                views.camera_to_world, self._centres, pairs, tolerance_m=self._settings.tolerance_m
-            )
+            eye = views.camera_to_world[:, :3, 3]
+            reached = self._simulator.reached(eye, self._centres, pairs, tolerance_m=self._settings.tolerance_m)
             agent, cell = pairs[reached].T
             first_seen[rows[agent], cell] = steps[agent]
             found += np.bincount(agent, minlength=len(found))

@@ -10,11 +10,11 @@ from avp_habitat.lookup import kernels
 from avp_habitat.lookup.disk import TileFiles
 from avp_habitat.lookup.lattice import Lattice
 from avp_habitat.lookup.rows import PlaceRows, words_for
-from avp_habitat.lookup.sight import seen_bits
+from avp_habitat.lookup.sight import seen_bits, single_rays
 from avp_habitat.lookup.tables import SPACING_M
 from avp_habitat.senses import Views
 from avp_habitat.settings import TaskSettings
-from avp_habitat.simulators.base import Simulator
+from avp_habitat.simulators.base import Simulator, SingleRays
 from avp_habitat.surface_senses import raise_quality
 from avp_habitat.surfaces import FULL_DISTANCE_M, SceneSurface, scene_surface
 
@@ -24,10 +24,10 @@ _VERSION = 1
 class SurfaceTables:
     """Which surface points are seen from the places that were asked for."""
 
-    def __init__(self, simulator: Simulator, settings: TaskSettings) -> None:
+    def __init__(self, simulator: SingleRays, settings: TaskSettings) -> None:
         """Make empty tables."""
         # Not held: the tables live as long as their simulator, whose users hold it.
-        self._simulator: Simulator = weakref.proxy(simulator)
+        self._simulator: SingleRays = weakref.proxy(simulator)
         self.surface: SceneSurface = scene_surface(simulator, settings)
         """The points that the bits stand for."""
         self._height_m, self._tolerance_m = settings.sensor_height_m, settings.tolerance_m
@@ -58,10 +58,14 @@ class TableSurface:
     """Points on which the tables' places differ are cast as rays, the others looked up."""
 
     def __init__(self, simulator: Simulator, settings: TaskSettings) -> None:
-        """Use the scene's tables."""
-        self._simulator = simulator
+        """Use the scene's tables.
+
+        Raises:
+            UsageError: the simulator cannot cast single rays, or the scene shows no surface.
+        """
+        self._simulator = single_rays(simulator, "lookup")
         self._settings = settings
-        self._tables = surface_tables(simulator, settings)
+        self._tables = surface_tables(self._simulator, settings)
         camera = settings.intrinsics
         self._camera = (
             *(float(camera.width), float(camera.height)),
@@ -76,9 +80,8 @@ class TableSurface:
         doubts = self._sure_points(views, slots, quality, rows, gain)
         if doubts:
             pairs, value = self._doubtful[:doubts], self._doubtful_q[:doubts]
-            reached = self._simulator.visible(
-                views.camera_to_world, points, pairs, tolerance_m=self._settings.tolerance_m
-            )
+            eye = views.camera_to_world[:, :3, 3]
+            reached = self._simulator.reached(eye, points, pairs, tolerance_m=self._settings.tolerance_m)
             gain += raise_quality(quality, rows, pairs[reached, 0], pairs[reached, 1], value[reached])
         return gain
 
@@ -118,10 +121,10 @@ def _room_for(pairs: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     return np.empty((pairs, 2), dtype=np.int64), np.empty(pairs, dtype=np.float32)
 
 
-_shared: weakref.WeakKeyDictionary[Simulator, dict[tuple[float, ...], SurfaceTables]] = weakref.WeakKeyDictionary()
+_shared: weakref.WeakKeyDictionary[SingleRays, dict[tuple[float, ...], SurfaceTables]] = weakref.WeakKeyDictionary()
 
 
-def surface_tables(simulator: Simulator, settings: TaskSettings) -> SurfaceTables:
+def surface_tables(simulator: SingleRays, settings: TaskSettings) -> SurfaceTables:
     """The tables for a scene and a task; tasks on the same open simulator share them."""
     key = (settings.sensor_height_m, settings.max_range_m, settings.tolerance_m)
     known = _shared.setdefault(simulator, {})

@@ -9,12 +9,10 @@ Tables are made tile by tile where agents come, so large scenes cost what is vis
 import hashlib
 import weakref
 from dataclasses import astuple, dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.errors import UsageError
 from avp_habitat.lookup import panorama
 from avp_habitat.lookup.disk import TileFiles
 from avp_habitat.lookup.lattice import Lattice
@@ -22,20 +20,11 @@ from avp_habitat.lookup.rows import PlaceRows, words_for
 from avp_habitat.lookup.sight import seen_bits
 from avp_habitat.poses import Intrinsics
 from avp_habitat.settings import TaskSettings
-from avp_habitat.simulators.base import Simulator
+from avp_habitat.simulators.base import SingleRays
 
 SPACING_M = 0.1
 """Distance between lattice points in metres. At 0.2 m the least depth is off by twice as much (docs/training.md)."""
-_VERSION = 2
-
-
-@runtime_checkable
-class RaySimulator(Simulator, Protocol):
-    """A simulator that casts single rays."""
-
-    def distance(self, origin: NDArray[np.floating], direction: NDArray[np.floating]) -> NDArray[np.float32]:
-        """`(k,)` metres from `(k, 3)` origins along `(k, 3)` unit directions to the first surface, inf for none."""
-        ...
+_VERSION = 3
 
 
 @dataclass(frozen=True)
@@ -65,7 +54,7 @@ class ViewKey:
 class SceneTables:
     """The tables of one scene, growing with the places that were asked for."""
 
-    def __init__(self, simulator: RaySimulator, key: ViewKey) -> None:
+    def __init__(self, simulator: SingleRays, key: ViewKey) -> None:
         """Make empty tables.
 
         Args:
@@ -73,7 +62,7 @@ class SceneTables:
             key: of the views.
         """
         # Not held: the tables live as long as their simulator, whose users hold it.
-        self._simulator: RaySimulator = weakref.proxy(simulator)
+        self._simulator: SingleRays = weakref.proxy(simulator)
         self.key = key
         self._samples = panorama.view_samples(key.intrinsics, key.pitches)
         self._directions = panorama.directions().reshape(-1, 3)
@@ -117,17 +106,11 @@ class SceneTables:
         return panorama.view_statistics(around, self._samples, self.key.max_range_m)
 
 
-_shared: weakref.WeakKeyDictionary[Simulator, dict[ViewKey, SceneTables]] = weakref.WeakKeyDictionary()
+_shared: weakref.WeakKeyDictionary[SingleRays, dict[ViewKey, SceneTables]] = weakref.WeakKeyDictionary()
 
 
-def scene_tables(simulator: Simulator, settings: TaskSettings) -> SceneTables:
-    """The tables for a scene and a task; tasks on the same open simulator share them.
-
-    Raises:
-        UsageError: the simulator cannot cast single rays.
-    """
-    if not isinstance(simulator, RaySimulator):
-        raise UsageError(f"lookup: expected the simulator 'raycast', got {simulator.name!r}; leave lookup off")
+def scene_tables(simulator: SingleRays, settings: TaskSettings) -> SceneTables:
+    """The tables for a scene and a task; tasks on the same open simulator share them."""
     key = ViewKey(
         sensor_height_m=settings.sensor_height_m,
         intrinsics=settings.intrinsics,

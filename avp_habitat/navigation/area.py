@@ -217,7 +217,7 @@ def build_area(
     """The part of a mesh's floor on which an agent can stand, by Recast's rules as Habitat-Sim sets them.
 
     Args:
-        mesh: metres, Y up, floors wound so that they face upwards.
+        mesh: metres, Y up; triangles may be wound either way round.
         surface_below: casts rays straight down on the same mesh; gives the floor's true height, which voxels round up.
         start: `(3,)` point in metres that selects the part nearest to it; without it the largest part is taken that is
             not a roof (open to the sky and over another part).

@@ -7,7 +7,7 @@ from avp_habitat.errors import SceneError
 from avp_habitat.navigation.area import Float, NavigableArea, SurfaceBelow
 from avp_habitat.navigation.boundary import largest_piece, outline
 from avp_habitat.navigation.filters import standing_places
-from avp_habitat.navigation.heightfield import Heightfield, level_triangles, voxelise
+from avp_habitat.navigation.heightfield import Heightfield, check_size, level_triangles, voxelise
 from avp_habitat.navigation.parts import Part, common_place, connected_parts, lay_flat, main_part, place_near
 from avp_habitat.navigation.settings import NavigationSettings
 from avp_habitat.navigation.walls import SKIN_M, Walls, are_inside, make_walls, off_walls
@@ -22,6 +22,7 @@ def build(
 ) -> NavigableArea:
     """See `avp_habitat.navigation.area.build_area`."""
     vertices, triangles = _used(mesh)
+    check_size(vertices, settings)
     _check_floor(vertices, triangles, settings)
     field = voxelise(vertices, triangles, settings)
     places = standing_places(field, settings)
@@ -58,11 +59,10 @@ def _used(mesh: TexturedMesh) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
 def _check_floor(vertices: NDArray[np.float32], triangles: NDArray[np.int32], settings: NavigationSettings) -> None:
     if level_triangles(vertices, triangles, settings.max_slope_deg).any():
         return
-    found = f"the scene has no floor: none of its {len(triangles)} triangles faces upwards (+Y) within "
-    found += f"{settings.max_slope_deg:g}° of level"
-    if level_triangles(vertices, triangles[:, ::-1], settings.max_slope_deg).any():
-        raise SceneError(f"{found}, but some face downwards; are the triangles wound the wrong way round?")
-    raise SceneError(f"{found}; is the mesh Z-up instead of Y-up?")
+    raise SceneError(
+        f"the scene has no floor: none of its {len(triangles)} triangles lies within {settings.max_slope_deg:g}° of "
+        "level; is the mesh Z-up instead of Y-up?"
+    )
 
 
 def _no_place(vertices: NDArray[np.float32], settings: NavigationSettings) -> str:
@@ -71,7 +71,7 @@ def _no_place(vertices: NDArray[np.float32], settings: NavigationSettings) -> st
     return (
         f"no agent can stand in the scene, which measures {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m (x, y, z): "
         f"expected {least:g} m² of connected floor with {settings.height_voxels * settings.voxel_height_m:g} m of free "
-        "height; is it not in metres, Z-up instead of Y-up, its floor wound to face downwards, or the ceiling lower "
+        "height; is it not in metres, Z-up instead of Y-up, or the ceiling lower "
         f"than {settings.agent_height_m:g} m?"
     )
 

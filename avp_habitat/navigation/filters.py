@@ -1,16 +1,17 @@
-"""Which tops of solid spans an agent can stand on and step between, by Recast's rules.
+"""Which tops of solid spans an agent can stand on and step between, by Recast's rules, however they are wound.
 
 Directions are numbered 0: -X, 1: +Z, 2: +X, 3: -Z. Source: M. Mononen, Recast Navigation 1.6.0 (filters, compact
-heightfield).
+heightfield). Recast takes for a floor what faces upwards. The same holds here for what is wound the wrong way round,
+seen from below: see `_walkable`.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from avp_habitat.navigation.heightfield import Heightfield
+from avp_habitat.compiled import njit
+from avp_habitat.navigation.heightfield import DOWNWARDS, UPWARDS, Heightfield
 from avp_habitat.navigation.settings import NavigationSettings
 
 SKY = 0xFFFF
@@ -37,13 +38,56 @@ def standing_places(field: Heightfield, settings: NavigationSettings) -> Standin
     """Apply the rules for low-hanging obstacles, ledges and low ceilings, and link the places that remain."""
     height, climb = settings.height_voxels, settings.climb_voxels
     ceiling = _ceilings(field.first, field.bottom)
-    walkable = _step_onto_low_obstacles(field.first, field.top, field.walkable, climb)
+    walkable = _walkable(field, ceiling, height, climb)
+    walkable = _step_onto_low_obstacles(field.first, field.top, walkable, climb)
     ledge = _ledges(field.first, field.bottom, field.top, ceiling, walkable, field.shape, height, climb)
-    walkable &= ~ledge & (ceiling - field.top >= height)
-    column = np.repeat(np.arange(len(field.first) - 1), np.diff(field.first))[walkable]
-    floor, ceiling = field.top[walkable], ceiling[walkable]
+    return _linked(field, walkable & ~ledge & (ceiling - field.top >= height), ceiling, height, climb)
+
+
+def _linked(field: Heightfield, kept: NDArray, ceiling: NDArray, height: int, climb: int) -> StandingPlaces:
+    """The spans' tops that are kept, each with those that a step leads to."""
+    column = np.repeat(np.arange(len(field.first) - 1), np.diff(field.first))[kept]
+    floor, ceiling = field.top[kept], ceiling[kept]
     first = np.searchsorted(column, np.arange(len(field.first)))
     return StandingPlaces(column, floor, ceiling, _neighbours(first, floor, ceiling, field.shape, height, climb))
+
+
+def _walkable(field: Heightfield, ceiling: NDArray, height: int, climb: int) -> NDArray[np.bool_]:
+    """`(n,)` whether an agent may step on the spans' tops, whichever way round their triangles are wound.
+
+    What tells floors from ceilings is the ground: the lowest level top of a column that has room for an agent. Where
+    more of the ground faces downwards than upwards, the whole scene is wound the wrong way round: what faces downwards
+    counts as facing upwards, and the other way about. Of the rest, as where one part of a scene is wound otherwise than
+    the others, what faces downwards is a floor where most of it is ground; a ceiling is not, for the floor is below it.
+    """
+    up, down = field.facing & UPWARDS > 0, field.facing & DOWNWARDS > 0
+    roomy = ceiling - field.top >= height
+    # The height of a sheet; in a wall, floor and ceiling are one span.
+    sheet = field.top - field.bottom <= climb + 1
+    ground = _ground(field.first, field.facing, roomy, sheet)
+    if (field.highest[ground] == DOWNWARDS).sum() > (field.highest[ground] == UPWARDS).sum():
+        up, down = down, up
+    doubtful = down & ~up & roomy
+    if not (ground & doubtful).any():
+        return up
+    return up | _mostly(field, doubtful, ground, ceiling, height, climb)
+
+
+def _mostly(
+    field: Heightfield, doubtful: NDArray, ground: NDArray, ceiling: NDArray, height: int, climb: int
+) -> NDArray[np.bool_]:
+    """`(n,)` the doubtful tops of connected pieces that are ground for the greater part."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    neighbour = _linked(field, doubtful, ceiling, height, climb).neighbour
+    begin, direction = np.nonzero(neighbour >= 0)
+    links = coo_matrix((np.ones(len(begin), bool), (begin, neighbour[begin, direction])), shape=(len(neighbour),) * 2)
+    piece = connected_components(links, directed=False)[1]
+    share = np.bincount(piece, ground[doubtful]) / np.bincount(piece)
+    result = np.zeros_like(doubtful)
+    result[doubtful] = share[piece] > 0.5
+    return result
 
 
 @njit(cache=True)
@@ -53,6 +97,20 @@ def _ceilings(first, bottom):
         for i in range(first[column], first[column + 1] - 1):
             ceiling[i] = bottom[i + 1]
     return ceiling
+
+
+@njit(cache=True)
+def _ground(first, facing, roomy, sheet):
+    """The lowest level top of each column that has room above; none that may be a ceiling over what faces upwards."""
+    result = np.zeros(len(roomy), np.bool_)
+    for column in range(len(first) - 1):
+        covers = False
+        for i in range(first[column], first[column + 1]):
+            if facing[i] and roomy[i]:
+                result[i] = facing[i] & UPWARDS or (sheet[i] and not covers)
+                break
+            covers |= facing[i] & UPWARDS > 0
+    return result
 
 
 @njit(cache=True)

@@ -10,9 +10,9 @@ import heapq
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from avp_habitat.compiled import njit
 from avp_habitat.navigation.walls import SKIN_M, Walls, near_line
 
 _OFF_M = 3 * SKIN_M

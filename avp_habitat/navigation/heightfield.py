@@ -1,21 +1,25 @@
 """Conservative voxelisation of a triangle mesh into columns of solid spans, by Recast's rules.
 
 Every triangle is cut along the borders of the columns that it touches, and fills in each of them the voxels between the
-lowest and the highest point of its piece. Touching spans of a column become one; its top is walkable when the piece
-that made the top, or one whose top lies within the climb of it, is. Single precision and the triangles' order are kept
-as Recast has them, because both decide on which side of a voxel border a level floor falls.
+lowest and the highest point of its piece. Touching spans of a column become one; its top faces as the piece that made
+the top does, or one whose top lies within the climb of it. Single precision and the triangles' order are kept as Recast
+has them, because both decide on which side of a voxel border a level floor falls. Recast knows floors that face upwards
+only; the surfaces that face downwards are kept too, for rooms whose triangles are wound the wrong way round.
 Source: M. Mononen, Recast Navigation (rasterisation).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from avp_habitat.compiled import njit
 from avp_habitat.errors import SceneError
 from avp_habitat.navigation.settings import NavigationSettings
 
+UPWARDS, DOWNWARDS = 1, 2
+"""Bits of level triangles that face upwards, and of those that face downwards."""
+_BOTH = UPWARDS | DOWNWARDS
 _MOST_COLUMNS = 40_000_000
 _HIGHEST_VOXEL = 8191
 
@@ -34,42 +38,54 @@ class Heightfield:
     """`(n,)` lowest voxel of each span."""
     top: NDArray[np.int32]
     """`(n,)` first voxel above each span."""
-    walkable: NDArray[np.bool_]
-    """`(n,)` whether an agent may step on the span's top."""
+    facing: NDArray[np.uint8]
+    """`(n,)` bits of what lies within the climb of each span's top, as Recast counts it."""
+    highest: NDArray[np.uint8]
+    """`(n,)` bits of what makes the top itself; 0 where that is not level."""
 
 
-def level_triangles(vertices: NDArray[np.float32], triangles: NDArray[np.int32], max_slope_deg: float) -> NDArray:
-    """`(t,)` bool: whether triangles face upwards within the slope; their winding tells what is up."""
+def level_triangles(
+    vertices: NDArray[np.float32], triangles: NDArray[np.int32], max_slope_deg: float
+) -> NDArray[np.int64]:
+    """`(t,)` `UPWARDS` or `DOWNWARDS`, as their winding tells, of triangles level within the slope; 0 of others."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     length = np.sqrt((normal * normal).sum(axis=1, dtype=np.float32))
-    return normal[:, 1] > np.float32(np.cos(np.radians(max_slope_deg))) * length
+    least = np.float32(np.cos(np.radians(max_slope_deg))) * length
+    return np.where(normal[:, 1] > least, UPWARDS, np.where(-normal[:, 1] > least, DOWNWARDS, 0))
+
+
+def check_size(vertices: NDArray[np.float32], settings: NavigationSettings) -> None:
+    """Refuse a mesh of which no voxels can be made, before any arithmetic on it overflows.
+
+    Raises:
+        SceneError: the mesh is so wide that its columns would not fit into memory; it is not in metres.
+    """
+    width, height, depth = vertices.max(axis=0).astype(np.float64) - vertices.min(axis=0)
+    most = _MOST_COLUMNS * settings.voxel_m**2
+    if width * depth > most or max(width, height, depth) > most:
+        raise SceneError(
+            f"the scene measures {width:.6g} x {height:.6g} x {depth:.6g} m (x, y, z): expected at most {most:.0f} m² "
+            "of floor; is it in millimetres or centimetres instead of metres?"
+        )
 
 
 def voxelise(vertices: NDArray[np.float32], triangles: NDArray[np.int32], settings: NavigationSettings) -> Heightfield:
     """Voxelise a mesh.
 
     Args:
-        vertices: `(v, 3)` metres, Y up, finite.
+        vertices: `(v, 3)` metres, Y up, finite, of a size that `check_size` passes.
         triangles: `(t, 3)` vertex indices.
         settings: voxel sizes, slope and climb.
-
-    Raises:
-        SceneError: the mesh is so wide that its columns would not fit into memory; it is not in metres.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     cell, level = np.float32(settings.voxel_m), np.float32(settings.voxel_height_m)
     columns, rows = (max(1, int((high[axis] - low[axis]) / cell + np.float32(0.5))) for axis in (0, 2))
-    if rows * columns > _MOST_COLUMNS:
-        raise SceneError(
-            f"the scene is {high[0] - low[0]:.0f} x {high[2] - low[2]:.0f} m wide: expected at most "
-            f"{_MOST_COLUMNS * settings.voxel_m**2:.0f} m²; is it in millimetres or centimetres instead of metres?"
-        )
     level_enough = level_triangles(vertices, triangles, settings.max_slope_deg)
-    first, bottom, top, walkable = _rasterise(
+    first, bottom, top, bits = _rasterise(
         vertices, triangles, level_enough, low, high, cell, level, rows, columns, settings.climb_voxels
     )
-    return Heightfield(low, (rows, columns), first, bottom, top, walkable)
+    return Heightfield(low, (rows, columns), first, bottom, top, bits & np.uint8(_BOTH), bits >> np.uint8(2))
 
 
 @njit(cache=True)
@@ -105,20 +121,23 @@ def _grown(array):
 
 
 @njit(cache=True)
-def _insert(head, pool, state, column, low, high, walkable, climb):
+def _insert(head, pool, state, column, low, high, facing, climb):
     """Add a span to a column's linked list, melting it with those that it touches.
 
-    `pool` rows are (bottom, top, walkable, next); `state` is (first free row of the pool or -1, rows ever used).
+    `pool` rows are (bottom, top, bits of facing and above them of highest, next); `state` is (first free row of the
+    pool or -1, rows ever used).
     """
-    before, at = -1, head[column]
+    before, at, highest = -1, head[column], facing
     while at >= 0 and pool[at, 0] <= high:
         after = pool[at, 3]
         if pool[at, 1] < low:
             before = at
         else:
+            if pool[at, 1] >= high:
+                highest = pool[at, 2] >> 2 | (highest if pool[at, 1] == high else 0)
             low, high = min(low, pool[at, 0]), max(high, pool[at, 1])
             if high - pool[at, 1] <= climb:
-                walkable = max(walkable, pool[at, 2])
+                facing |= pool[at, 2] & _BOTH
             pool[at, 3], state[0] = state[0], at
             if before >= 0:
                 pool[before, 3] = after
@@ -131,7 +150,7 @@ def _insert(head, pool, state, column, low, high, walkable, climb):
     else:
         slot = state[1]
         state[1] += 1
-    pool[slot, 0], pool[slot, 1], pool[slot, 2], pool[slot, 3] = low, high, walkable, at
+    pool[slot, 0], pool[slot, 1], pool[slot, 2], pool[slot, 3] = low, high, facing | highest << 2, at
     if before >= 0:
         pool[before, 3] = slot
     else:
@@ -186,15 +205,15 @@ def _rasterise(vertices, triangles, level_enough, low, high, cell, level, rows, 
             rest, spare = spare, rest
             if in_row >= 3 and z >= 0:
                 column_heads = head[z * columns : (z + 1) * columns]
-                walkable = np.int64(level_enough[t])
+                facing = level_enough[t]
                 pool = _fill_row(
-                    column_heads, pool, state, row, in_row, piece, spare, low, high, cell, level, walkable, climb
+                    column_heads, pool, state, row, in_row, piece, spare, low, high, cell, level, facing, climb
                 )
     return _flattened(head, pool)
 
 
 @njit(cache=True)
-def _fill_row(head, pool, state, row, in_row, piece, spare, low, high, cell, level, walkable, climb):
+def _fill_row(head, pool, state, row, in_row, piece, spare, low, high, cell, level, facing, climb):
     """Cut a triangle's piece in one row of columns into columns; returns the pool, which may have moved."""
     along_x = np.int64(0)
     start, end = _extent(row, in_row, along_x, low[0], np.float32(1) / cell, len(head))
@@ -208,7 +227,7 @@ def _fill_row(head, pool, state, row, in_row, piece, spare, low, high, cell, lev
         if top > bottom:
             if state[0] < 0 and state[1] == len(pool):
                 pool = _grown(pool)
-            _insert(head, pool, state, x, bottom, top, walkable, climb)
+            _insert(head, pool, state, x, bottom, top, facing, climb)
     return pool
 
 
@@ -221,10 +240,10 @@ def _flattened(head, pool):
             count, at = count + 1, pool[at, 3]
         first[column + 1] = first[column] + count
     bottom, top = np.empty(first[-1], np.int32), np.empty(first[-1], np.int32)
-    walkable = np.empty(first[-1], np.bool_)
+    bits = np.empty(first[-1], np.uint8)
     for column in range(len(head)):
         at = head[column]
         for i in range(first[column], first[column + 1]):
-            bottom[i], top[i], walkable[i] = pool[at, 0], pool[at, 1], pool[at, 2] != 0
+            bottom[i], top[i], bits[i] = pool[at, 0], pool[at, 1], pool[at, 2]
             at = pool[at, 3]
-    return first, bottom, top, walkable
+    return first, bottom, top, bits

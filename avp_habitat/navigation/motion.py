@@ -6,9 +6,9 @@ too long.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from avp_habitat.compiled import njit
 from avp_habitat.navigation.walls import SKIN_M, Walls, near_line
 
 _MOST_CONTACTS = 32

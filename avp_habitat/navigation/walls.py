@@ -7,8 +7,9 @@ numba keeps their cached versions.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from avp_habitat.compiled import njit
 
 SKIN_M = 1e-4
 """Distance in metres at which agents stop before a wall, so that every later test against it is safe from rounding."""

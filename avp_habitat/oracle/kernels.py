@@ -1,7 +1,8 @@
 """The compiled loops of the oracle over bit sets of floor cells (64 cells to a word)."""
 
 import numpy as np
-from numba import njit
+
+from avp_habitat.compiled import njit
 
 _ONE = np.uint64(1)
 _STRAIGHT, _DIAGONAL = 5, 7

@@ -7,17 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from avp_habitat.lookup.sight import seen_bits
 from avp_habitat.motion import sensor_poses
 from avp_habitat.oracle.surfaces import SURFACE_RANGE_M, surface_points
 from avp_habitat.poses import Intrinsics, pixel_directions
 from avp_habitat.settings import TaskSettings
-from avp_habitat.simulators.base import Simulator
+from avp_habitat.simulators.base import Simulator, SingleRays
 
 Float = NDArray[np.float64]
 Bits = NDArray[np.uint64]
 
 TABLE_ENTRIES = 30_000_000
 """Most pairs of a place and a cell: one ray each to prepare, and two bytes each to keep."""
+_PANORAMAS = 1500
+"""Most places of a simulator that renders six images for each of them instead of casting single rays."""
 _RAYS_PER_CALL = 1 << 20
 _NEAR_M = 1.0
 """A cell nearer than this on the floor is below the image of a camera that looks ahead."""
@@ -130,7 +133,7 @@ _lattices: weakref.WeakKeyDictionary[Simulator, dict[tuple, Lattice]] = weakref.
 def make_lattice(
     simulator: Simulator, settings: TaskSettings, *, beyond_floor: Float | None = None, entries: int = TABLE_ENTRIES
 ) -> Lattice:
-    """Cast a ray from every place to every cell within range, and find the ways between the places.
+    """Look from every place at every cell within range, and find the ways between the places.
 
     Args:
         simulator: of the scene.
@@ -144,7 +147,8 @@ def make_lattice(
 
     area = simulator.area
     points = np.concatenate([area.centres, np.empty((0, 3)) if beyond_floor is None else beyond_floor])
-    stride, cells = _stride(area.mask, entries // len(points))
+    most = entries // len(points)
+    stride, cells = _stride(area.mask, most if isinstance(simulator, SingleRays) else min(most, _PANORAMAS))
     places = area.centres[cells]
     range_m = np.full(len(points), settings.max_range_m)
     range_m[len(area.centres) :] = np.minimum(SURFACE_RANGE_M, settings.max_range_m)
@@ -189,16 +193,10 @@ def _stride(mask: NDArray[np.bool_], most: int) -> tuple[int, NDArray[np.int64]]
 
 
 def _unhidden(simulator: Simulator, places: Float, points: Float, range_m: Float, settings: TaskSettings) -> Bits:
-    ahead = np.zeros(len(places))
-    pose = sensor_poses(settings, places, ahead, ahead)
+    eye = places + [0.0, settings.sensor_height_m, 0.0]
     chunk = max(1, _RAYS_PER_CALL // len(points))
-    sets = []
-    for start in range(0, len(places), chunk):
-        cameras = pose[start : start + chunk]
-        distance = np.linalg.norm(points[None] - cameras[:, None, :3, 3], axis=-1)
-        pairs = np.argwhere(distance <= range_m)
-        reached = simulator.visible(cameras, points, pairs, tolerance_m=settings.tolerance_m)
-        members = np.zeros(distance.shape, dtype=np.bool_)
-        members[tuple(pairs[reached].T)] = True
-        sets.append(pack(members))
+    sets = [
+        seen_bits(simulator, eye[start : start + chunk], points, reach_m=range_m, tolerance_m=settings.tolerance_m)
+        for start in range(0, len(eye), chunk)
+    ]
     return np.concatenate(sets)

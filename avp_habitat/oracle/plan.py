@@ -91,9 +91,10 @@ def planned_coverage(view: AgentView, actions: NDArray[np.int64]) -> NDArray[np.
         states.append(state)
     position, yaw, pitch = (np.concatenate(parts) for parts in zip(*states, strict=True))
     sensor, points = sensor_poses(settings, position, yaw, pitch), simulator.area.centres
+    camera = settings.intrinsics
     unseen = np.broadcast_to(~view.observed, (len(actions), len(points)))
-    pairs = candidates(sensor, settings.intrinsics, points, unseen, max_range_m=settings.max_range_m)
-    reached = simulator.visible(sensor, points, pairs, tolerance_m=settings.tolerance_m)
+    pairs = candidates(sensor, camera, points, unseen, max_range_m=settings.max_range_m)
+    reached = simulator.visible(sensor, camera, points, pairs, tolerance_m=settings.tolerance_m)
     first = np.full(len(points), len(actions))
     np.minimum.at(first, pairs[reached, 1], pairs[reached, 0])
     new = np.bincount(first, minlength=len(actions) + 1)[: len(actions)]

@@ -23,7 +23,7 @@ _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 
 
 def export_glb(mesh: TexturedMesh, path: Path) -> None:
-    """Write a mesh as binary glTF 2.0 with unlit materials, embedded PNG textures and `COLOR_0`.
+    """Write a mesh as binary glTF 2.0 with unlit materials, embedded PNG textures, `COLOR_0`, and masks as alpha.
 
     Args:
         mesh: world frame, metres, Y up (glTF's own axes).
@@ -68,29 +68,41 @@ def _encode(mesh: TexturedMesh) -> bytes:
         asset=pygltflib.Asset(version="2.0", generator="avp_habitat"),
     )
     blob = _Blob(document)
-    for texture in sorted(set(mesh.texture_index.tolist())):
-        _add_primitive(document, blob, mesh, texture)
+    mask_index = np.full_like(mesh.texture_index, -1) if mesh.mask_index is None else mesh.mask_index
+    for texture, mask in sorted(set(zip(mesh.texture_index.tolist(), mask_index.tolist(), strict=True))):
+        _add_primitive(document, blob, mesh, (mesh.texture_index == texture) & (mask_index == mask), texture, mask)
     content = blob.content()
     document.buffers = [pygltflib.Buffer(byteLength=len(content))]
     document.set_binary_blob(content)
     return b"".join(document.save_to_bytes())
 
 
-def _add_primitive(document, blob: "_Blob", mesh: TexturedMesh, texture: int) -> None:
-    """Append the triangles that share a texture (-1 for none) as one primitive with its own material."""
+def _add_primitive(
+    document, blob: "_Blob", mesh: TexturedMesh, own: NDArray[np.bool_], texture: int, mask: int
+) -> None:
+    """Append the triangles that share a texture and a mask (-1 for none) as one primitive with its own material."""
     import pygltflib
 
-    triangles = mesh.triangles[mesh.texture_index == texture]
-    used, corners = np.unique(triangles, return_inverse=True)
+    used, corners = np.unique(mesh.triangles[own], return_inverse=True)
     attributes = pygltflib.Attributes(
         POSITION=blob.add_vectors(mesh.vertices[used], bounds=True), COLOR_0=blob.add_vectors(mesh.colours[used])
     )
     shading = pygltflib.PbrMetallicRoughness(metallicFactor=0.0)
     if texture >= 0:
         attributes.TEXCOORD_0 = blob.add_vectors(mesh.uv[used])
-        shading.baseColorTexture = pygltflib.TextureInfo(index=blob.add_picture(mesh.textures[texture]))
+        pixels = mesh.textures[texture]
+        if mask >= 0:
+            pixels = np.dstack([pixels, np.where(mesh.masks[mask], np.uint8(255), np.uint8(0))])
+        shading.baseColorTexture = pygltflib.TextureInfo(index=blob.add_picture(pixels))
+    mode, cutoff = ("MASK", 0.5) if mask >= 0 else ("OPAQUE", None)
     document.materials.append(
-        pygltflib.Material(pbrMetallicRoughness=shading, doubleSided=True, extensions={_UNLIT: {}})
+        pygltflib.Material(
+            pbrMetallicRoughness=shading,
+            doubleSided=True,
+            alphaMode=mode,
+            alphaCutoff=cutoff,
+            extensions={_UNLIT: {}},
+        )
     )
     indices = blob.add_indices(corners.reshape(-1))
     document.meshes[0].primitives.append(
@@ -129,7 +141,7 @@ class _Blob:
         return len(self._document.accessors) - 1
 
     def add_picture(self, pixels: NDArray[np.uint8]) -> int:
-        """Texture of `(height, width, 3)` pixels, repeating, stored as PNG."""
+        """Texture of `(height, width, 3 or 4)` pixels, repeating, stored as PNG."""
         import pygltflib
         from PIL import Image
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import os
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -15,7 +16,11 @@ SUFFIXES = (".glb", ".gltf", ".ply", ".obj")
 
 
 class SceneFiles:
-    """Reads a scene's file and the files it refers to, none of which may lie outside the scene's folder."""
+    """Reads a scene's file and the files it refers to, none of which may lie outside the scene's folder.
+
+    What counts is the path as it is written: links may lead anywhere, as they do in the stores of Hugging Face, DVC and
+    git-annex.
+    """
 
     def __init__(self, path: Path) -> None:
         """Open the scene stored at `path`.
@@ -24,7 +29,7 @@ class SceneFiles:
             SceneError: the file cannot be read, or has no byte.
         """
         self.path = path
-        self._folder = path.parent.resolve()
+        self._folder = Path(os.path.abspath(path.parent))
         self._referenced: dict[str, bytes] = {}
         self.main = self._read(path)
         if not self.main:
@@ -40,7 +45,7 @@ class SceneFiles:
             SceneError: the file is missing or lies outside the scene's folder.
         """
         name = unquote(uri).replace("\\", "/")
-        target = (self._folder / name).resolve()
+        target = Path(os.path.normpath(self._folder / name))
         if not target.is_relative_to(self._folder):
             raise SceneError(f"{self.path}: refers to {uri!r}, which lies outside the folder of the scene")
         if name not in self._referenced:
@@ -59,15 +64,41 @@ class SceneFiles:
             return path.read_bytes()
         except OSError as error:
             owner = "" if path == self.path else f" (referred to by {self.path.name})"
-            raise SceneError(f"{path}{owner}: cannot be read: {error.strerror}") from error
+            raise SceneError(f"{path}{owner}: {broken_link(path) or f'cannot be read: {error.strerror}'}") from error
 
 
-def decode_picture(content: bytes, name: str) -> NDArray[np.uint8]:
-    """Pixels, `(height, width, 3)` uint8 as stored (sRGB), of an encoded picture; transparency is dropped.
+def check_memory(name: str, needed: int) -> None:
+    """Refuse what would not fit into the memory that is free, before it is asked for.
+
+    Args:
+        name: of the file, and what in it is meant.
+        needed: bytes.
+
+    Raises:
+        SceneError: it does not fit.
+    """
+    try:
+        free = 1024 * int(Path("/proc/meminfo").read_text().partition("MemAvailable:")[2].split()[0])
+    except (OSError, LookupError):
+        free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if needed > free:
+        raise SceneError(f"{name} takes {needed / 1e9:.1f} GB of memory, of which {free / 1e9:.1f} GB are free")
+
+
+def broken_link(path: Path) -> str | None:
+    """What is wrong with a link that leads nowhere, as where a store's content was not fetched; None for others."""
+    if not path.is_symlink() or path.exists():
+        return None
+    return f"is a link to {os.readlink(path)}, where there is no file; fetch it (dvc pull, git annex get, say)"
+
+
+def decode_picture(content: bytes, name: str, mode: str = "RGB") -> NDArray[np.uint8]:
+    """Pixels, `(height, width, 3)` uint8 as stored (sRGB), of an encoded picture; with alpha as a fourth for RGBA.
 
     Args:
         content: an encoded PNG, JPEG or other format that Pillow reads.
         name: what to call the picture in an error.
+        mode: `RGB` or `RGBA`; greys of 16 bits, which have no alpha, have three values in both.
 
     Raises:
         SceneError: the bytes are no picture.
@@ -76,10 +107,13 @@ def decode_picture(content: bytes, name: str) -> NDArray[np.uint8]:
 
     try:
         with Image.open(io.BytesIO(content)) as image:
+            check_memory(
+                f"{name}: its picture of {image.width} x {image.height} pixels", 8 * image.width * image.height
+            )
             if image.mode.startswith("I"):
                 # Pillow clips 16-bit greys to 255 when it converts them, instead of scaling them.
                 grey = (np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8)
                 return np.repeat(grey[..., None], 3, axis=2)
-            return np.ascontiguousarray(image.convert("RGB"))
+            return np.ascontiguousarray(image.convert(mode))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise SceneError(f"{name}: the picture cannot be decoded: {error}") from error

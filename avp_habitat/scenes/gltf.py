@@ -1,10 +1,8 @@
 """Reads glTF 2.0 (`.glb`, `.gltf`) into one TexturedMesh."""
 
-import math
 import struct
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,11 +10,16 @@ import pygltflib
 from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
-from avp_habitat.scenes.files import SceneFiles, decode_picture
-from avp_habitat.scenes.gltf_buffers import Buffers
+from avp_habitat.scenes.files import SceneFiles, check_memory, decode_picture
+from avp_habitat.scenes.gltf_buffers import Buffers, fractions
+from avp_habitat.scenes.gltf_materials import SUPPORTED, Surface, ignored, surface_of
+from avp_habitat.scenes.masks import only, with_mask
 from avp_habitat.scenes.mesh import TexturedMesh, merge
+from avp_habitat.scenes.notices import say_once
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_VERTEX_BYTES, _CORNER_BYTES = 160, 30
+"""What reading takes at most for each vertex and each triangle's corner, copies included."""
 # What walking through a document raises where a field is missing, of another type or out of range.
 _MALFORMED = (
     ArithmeticError,
@@ -29,28 +32,6 @@ _MALFORMED = (
     ValueError,
     struct.error,
 )
-_SUPPORTED = {
-    "EXT_texture_webp",
-    "KHR_lights_punctual",
-    "KHR_materials_emissive_strength",
-    "KHR_materials_unlit",
-    "KHR_mesh_quantization",
-    "KHR_texture_transform",
-}
-
-
-@dataclass(frozen=True)
-class _Surface:
-    """What a material says about colour."""
-
-    factor: NDArray[np.float32]
-    """`(3,)` base-colour factor."""
-    texture: NDArray[np.uint8] | None
-    """Base-colour picture."""
-    coordinates: str
-    """Name of the attribute that holds the texture coordinates."""
-    transform: NDArray[np.float32]
-    """`(2, 3)` affine map of the texture coordinates."""
 
 
 def read_gltf(files: SceneFiles) -> TexturedMesh:
@@ -69,6 +50,26 @@ def read_gltf(files: SceneFiles) -> TexturedMesh:
         raise SceneError(f"{files.path}: expected a valid glTF 2.0 file, but it is damaged: {reason}") from error
 
 
+def shown_as_it_is(files: SceneFiles) -> bool:
+    """Whether Habitat-Sim 0.3.4 shows a document's materials, and walks on its floors, as the suite does.
+
+    It draws what is masked, under flat shading leaves out what materials emit, and takes the floors below a mirroring
+    node, which it draws rightly, for ceilings (the NavMesh's mesh is joined without turning the winding over). What the
+    suite cannot read, as textures of HM3D, is left to it.
+
+    Raises:
+        SceneError: the file is damaged.
+    """
+    try:
+        document = _parse(files.main)
+        surfaces = [surface_of(material) for material in document.materials or []]
+        mirrored = any(np.linalg.det(_local_transform(node)[:3, :3]) < 0 for node in document.nodes)
+    except _MALFORMED as error:
+        raise SceneError(f"{files.path}: expected a valid glTF 2.0 file, but it is damaged: {error}") from error
+    foreign = set(document.extensionsRequired or []) - SUPPORTED
+    return bool(foreign) or (not mirrored and all(surface.cutoff is None and surface.tinted for surface in surfaces))
+
+
 class _Reader:
     """One document on its way to a mesh."""
 
@@ -77,10 +78,11 @@ class _Reader:
         self._document = _parse(files.main)
         self._buffers = Buffers(self._document, files)
         self._pictures: dict[int, NDArray[np.uint8]] = {}
+        self._masks: dict[tuple[int, float], NDArray[np.bool_]] = {}
         version = str(self._document.asset.version)
         if not version.startswith("2."):
             raise SceneError(f"{files.path}: expected glTF 2.0, got version {version}")
-        unsupported = sorted(set(self._document.extensionsRequired or []) - _SUPPORTED)
+        unsupported = sorted(set(self._document.extensionsRequired or []) - SUPPORTED)
         if unsupported:
             raise SceneError(
                 f"{files.path}: requires the glTF extension {', '.join(unsupported)}, which is not supported; "
@@ -89,12 +91,16 @@ class _Reader:
 
     def mesh(self) -> TexturedMesh:
         """All triangles of the default scene, placed in the world."""
-        parts = [
-            part
+        if phrases := ignored(self._document):
+            say_once(str(self._path), "; ".join(phrases))
+        placed = [
+            (primitive, to_world)
             for mesh, to_world in self._placed_meshes()
             for primitive in self._document.meshes[mesh].primitives
-            if (part := self._primitive(primitive, to_world)) is not None
         ]
+        # A small file can name the same vertices again and again.
+        check_memory(f"{self._path}: its mesh", sum(self._bytes_of(primitive) for primitive, _ in placed))
+        parts = [part for each in placed if (part := self._primitive(*each)) is not None]
         if not parts:
             raise SceneError(f"{self._path}: expected a mesh with triangles, found none in the default scene")
         return merge(parts)
@@ -121,6 +127,12 @@ class _Reader:
                 yield node.mesh, to_world
             waiting += [(child, to_world) for child in reversed(node.children or [])]
 
+    def _bytes_of(self, primitive: pygltflib.Primitive) -> int:
+        position = primitive.attributes.POSITION
+        vertices = 0 if position is None else self._document.accessors[position].count
+        corners = vertices if primitive.indices is None else self._document.accessors[primitive.indices].count
+        return _VERTEX_BYTES * vertices + _CORNER_BYTES * corners
+
     def _primitive(self, primitive: pygltflib.Primitive, to_world: NDArray) -> TexturedMesh | None:
         mode = _TRIANGLES if primitive.mode is None else primitive.mode
         attributes = primitive.attributes
@@ -130,18 +142,33 @@ class _Reader:
             raise SceneError(f"{self._path}: uses KHR_draco_mesh_compression, which is not supported")
         local = self._buffers.array(attributes.POSITION).astype(np.float64)
         vertices = local @ to_world[:3, :3].T + to_world[:3, 3]
-        surface = self._surface(primitive.material)
         triangles = self._triangles(primitive.indices, mode, len(vertices))
+        if np.linalg.det(to_world[:3, :3]) < 0:
+            # A mirroring node turns the winding over (glTF 2.0, section 3.7.4).
+            triangles = triangles[:, ::-1]
+        surface = surface_of(None if primitive.material is None else self._document.materials[primitive.material])
         uv = self._coordinates(attributes, surface, len(vertices))
-        textured = surface.texture is not None and uv is not None
-        return TexturedMesh(
+        textures = [] if uv is None or surface.texture is None else [self._picture(surface.texture)]
+        colours = self._colours(attributes, surface, len(vertices))
+        mesh = TexturedMesh(
             vertices,
             triangles,
             np.zeros((len(vertices), 2), np.float32) if uv is None else uv,
-            self._colours(attributes, surface, len(vertices)),
-            np.full(len(triangles), 0 if textured else -1, np.int32),
-            [surface.texture] if textured and surface.texture is not None else [],
+            np.ascontiguousarray(colours[:, :3]),
+            np.full(len(triangles), len(textures) - 1, np.int32),
+            textures,
         )
+        return mesh if surface.cutoff is None else self._masked(mesh, colours[:, 3], surface)
+
+    def _masked(self, mesh: TexturedMesh, alpha: NDArray[np.float32], surface: Surface) -> TexturedMesh:
+        """What alphaMode MASK leaves: factor and vertex alpha decide for triangles, the picture within them."""
+        assert surface.cutoff is not None
+        share = alpha[mesh.triangles].mean(axis=1)
+        kept = share >= surface.cutoff
+        mesh = only(mesh, kept)
+        if surface.texture is None or not mesh.textures or not kept.any():
+            return mesh
+        return with_mask(mesh, self._mask(surface.texture, surface.cutoff / float(share[kept].mean())))
 
     def _has_data(self, accessor: int) -> bool:
         return self._document.accessors[accessor].bufferView is not None
@@ -155,17 +182,20 @@ class _Reader:
             raise SceneError(f"{self._path}: a triangle names vertex {corners.max()} of {vertices}")
         return _corners_to_triangles(corners, mode).astype(np.int32)
 
-    def _coordinates(self, attributes: Any, surface: _Surface, vertices: int) -> NDArray[np.float32] | None:
-        accessor = getattr(attributes, surface.coordinates, None)
+    def _coordinates(self, attributes: Any, surface: Surface, vertices: int) -> NDArray[np.float32] | None:
+        accessor = None if surface.texture is None else getattr(attributes, surface.coordinates, None)
         if accessor is None:
             return None
         uv = self._matching(accessor, surface.coordinates, vertices)[:, :2].astype(np.float32)
-        return uv @ surface.transform[:, :2].T + surface.transform[:, 2]
+        return uv if surface.transform is None else uv @ surface.transform[:, :2].T + surface.transform[:, 2]
 
-    def _colours(self, attributes: Any, surface: _Surface, vertices: int) -> NDArray[np.float32]:
-        colours = np.broadcast_to(surface.factor, (vertices, 3))
+    def _colours(self, attributes: Any, surface: Surface, vertices: int) -> NDArray[np.float32]:
+        """`(v, 4)` colours and alpha; integers count as fractions even where a file forgets to say so."""
+        colours = np.broadcast_to(surface.factor, (vertices, 4)).copy()
         if attributes.COLOR_0 is not None:
-            colours = self._matching(attributes.COLOR_0, "COLOR_0", vertices)[:, :3] * colours
+            stored = fractions(self._matching(attributes.COLOR_0, "COLOR_0", vertices))
+            first, last = (0 if surface.tinted else 3), stored.shape[1]
+            colours[:, first:last] *= stored[:, first:]
         return np.clip(colours, 0, 1).astype(np.float32)
 
     def _matching(self, accessor: int, name: str, vertices: int) -> NDArray:
@@ -176,30 +206,34 @@ class _Reader:
             )
         return values
 
-    def _surface(self, index: int | None) -> _Surface:
-        material = None if index is None else self._document.materials[index]
-        shading = material.pbrMetallicRoughness if material else None
-        factor = (shading.baseColorFactor if shading else None) or [1.0, 1.0, 1.0]
-        info = shading.baseColorTexture if shading else None
-        if info is None or info.index is None:
-            return _Surface(np.array(factor[:3], np.float32), None, "TEXCOORD_0", np.eye(2, 3, dtype=np.float32))
-        moved = (info.extensions or {}).get("KHR_texture_transform", {})
-        channel = moved.get("texCoord", info.texCoord or 0)
-        return _Surface(
-            np.array(factor[:3], np.float32), self._picture(info.index), f"TEXCOORD_{channel}", _uv_transform(moved)
-        )
-
     def _picture(self, texture: int) -> NDArray[np.uint8]:
+        """`(height, width, 3)`; the same object for the same image."""
+        index = self._image(texture)
+        if index not in self._pictures:
+            self._pictures[index] = decode_picture(*self._encoded(index))
+        return self._pictures[index]
+
+    def _mask(self, texture: int, least: float) -> NDArray[np.bool_]:
+        """`(height, width)` where a picture's alpha is at least so much; the same object for the same question."""
+        key = (self._image(texture), least)
+        if key not in self._masks:
+            alpha = decode_picture(*self._encoded(key[0]), "RGBA")[..., 3:]
+            self._masks[key] = (alpha >= 255 * least)[..., 0] if alpha.size else np.ones(alpha.shape[:2], bool)
+        return self._masks[key]
+
+    def _image(self, texture: int) -> int:
         entry = self._document.textures[texture]
         index = (entry.extensions or {}).get("EXT_texture_webp", {}).get("source", entry.source)
         if index is None:
             names = ", ".join(entry.extensions or {}) or "no picture"
             raise SceneError(f"{self._path}: texture {texture} has {names}; expected a PNG, JPEG or WebP picture")
-        if index not in self._pictures:
-            image = self._document.images[index]
-            content = self._buffers.resolve(image.uri) if image.uri else bytes(self._buffers.view(image.bufferView))
-            self._pictures[index] = decode_picture(content, f"{self._path}: image {index}")
-        return self._pictures[index]
+        return index
+
+    def _encoded(self, index: int) -> tuple[bytes, str]:
+        """An image's bytes, and its name for errors."""
+        image = self._document.images[index]
+        content = self._buffers.resolve(image.uri) if image.uri else bytes(self._buffers.view(image.bufferView))
+        return content, f"{self._path}: image {index}"
 
 
 def _parse(content: bytes) -> pygltflib.GLTF2:
@@ -256,11 +290,3 @@ def _corners_to_triangles(corners: NDArray, mode: int) -> NDArray:
     if mode == _STRIP:
         triangles[1::2] = triangles[1::2][:, [1, 0, 2]]
     return triangles
-
-
-def _uv_transform(entry: dict[str, Any]) -> NDArray[np.float32]:
-    """`(2, 3)` affine map of KHR_texture_transform: scale, then rotate (counter-clockwise as seen), then shift."""
-    angle = float(entry.get("rotation", 0.0))
-    scale, offset = entry.get("scale", [1.0, 1.0]), entry.get("offset", [0.0, 0.0])
-    rotation = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
-    return np.column_stack([rotation * np.array(scale), offset]).astype(np.float32)

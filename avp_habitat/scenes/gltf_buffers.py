@@ -72,7 +72,7 @@ class Buffers:
         values = self._dense(index, dtype, shape)
         if accessor.sparse is not None:
             values = self._with_sparse(accessor.sparse, values, dtype)
-        return _from_normalised(values) if accessor.normalized and dtype.kind in "iu" else values
+        return fractions(values) if accessor.normalized else values
 
     def _buffer(self, index: int) -> bytes:
         if index not in self._content:
@@ -86,7 +86,7 @@ class Buffers:
     def _dense(self, index: int, dtype: np.dtype, shape: tuple[int, int]) -> NDArray:
         accessor = self._document.accessors[index]
         if accessor.bufferView is None:
-            return np.zeros(shape, dtype)
+            return self._zeros(index, dtype, shape)
         stride = self._document.bufferViews[accessor.bufferView].byteStride or dtype.itemsize * shape[1]
         data, offset = self.view(accessor.bufferView), accessor.byteOffset or 0
         end = offset + (shape[0] - 1) * stride + dtype.itemsize * shape[1]
@@ -96,6 +96,16 @@ class Buffers:
                 f"of a buffer view with {len(data)} bytes"
             )
         return np.ndarray(shape, dtype, data, offset, (stride, dtype.itemsize))
+
+    def _zeros(self, index: int, dtype: np.dtype, shape: tuple[int, int]) -> NDArray:
+        """What an accessor without data holds; it costs no byte of the file, so that its count may be anything."""
+        most = sum(len(self._buffer(buffer)) for buffer in range(len(self._document.buffers)))
+        if shape[0] > most:
+            raise SceneError(
+                f"{self._files.path}: accessor {index} claims {shape[0]} elements without any data for them, in a file "
+                f"whose buffers hold {most} bytes"
+            )
+        return np.zeros(shape, dtype)
 
     def _with_sparse(self, sparse: pygltflib.Sparse, values: NDArray, dtype: np.dtype) -> NDArray:
         where = np.dtype(_COMPONENT[sparse.indices.componentType])
@@ -107,6 +117,8 @@ class Buffers:
         return values
 
 
-def _from_normalised(values: NDArray) -> NDArray[np.float32]:
-    """Integers to fractions of their type's greatest value (glTF 2.0, section 3.11: -128 and -127 are both -1)."""
+def fractions(values: NDArray) -> NDArray:
+    """Integers as fractions of their type's greatest value (glTF 2.0, section 3.11: -128 and -127 are both -1)."""
+    if values.dtype.kind == "f":
+        return values
     return np.maximum(values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max), np.float32(-1.0))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from avp_habitat.errors import AVPError, SceneError, UsageError
 from avp_habitat.scenes import replica
-from avp_habitat.scenes.files import SUFFIXES
+from avp_habitat.scenes.files import SUFFIXES, broken_link
 from avp_habitat.scenes.stage_config import STAGE_CONFIG, Y_UP, Z_UP, Layer, Vector, read_config, read_stage
 
 BUILTIN = "builtin:"
@@ -162,6 +162,8 @@ def _expect_file(path: Path, endings: tuple[str, ...]) -> None:
         return
     if path.exists():
         raise SceneError(f"{path}: expected a scene file, found a folder")
+    if broken := broken_link(path):
+        raise SceneError(f"{path}: {broken}")
     if not path.parent.is_dir():
         raise SceneError(f"{path}: there is no folder {path.parent}")
     names = sorted(entry.name for entry in path.parent.iterdir() if entry.name.lower().endswith(endings))

@@ -26,6 +26,10 @@ class TexturedMesh:
     """`(t,)` index into `textures`, -1 for none."""
     textures: list[NDArray[np.uint8]] = field(default_factory=list)
     """`(height, width, 3)` sRGB pictures."""
+    mask_index: NDArray[np.int32] | None = None
+    """`(t,)` index into `masks`, -1 for none; None where no triangle has a mask."""
+    masks: list[NDArray[np.bool_]] = field(default_factory=list)
+    """`(height, width)` where, in texture coordinates, there is a surface; elsewhere is a hole."""
 
     def __post_init__(self) -> None:
         """Check the shapes, which are the contract between loaders and renderers."""
@@ -43,30 +47,20 @@ class TexturedMesh:
 
 
 def merge(parts: list[TexturedMesh]) -> TexturedMesh:
-    """One mesh of several; textures that are the same object are kept once."""
-    textures: list[NDArray[np.uint8]] = []
-    slot: dict[int, int] = {}
-    vertices, triangles, uv, colours, index = [], [], [], [], []
-    offset = 0
-    for part in parts:
-        for texture in part.textures:
-            if id(texture) not in slot:
-                slot[id(texture)] = len(textures)
-                textures.append(texture)
-        lookup = np.array([slot[id(texture)] for texture in part.textures] + [-1], dtype=np.int32)
-        vertices.append(part.vertices)
-        triangles.append(part.triangles + np.int32(offset))
-        uv.append(part.uv)
-        colours.append(part.colours)
-        index.append(lookup[part.texture_index])
-        offset += len(part.vertices)
+    """One mesh of several; textures and masks that are the same object are kept once."""
+    offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
+    textures, lookups = _kept_once([part.textures for part in parts])
+    masks, mask_lookups = _kept_once([part.masks for part in parts])
+    without = [np.full(len(part.triangles), -1) if part.mask_index is None else part.mask_index for part in parts]
     return TexturedMesh(
-        np.concatenate(vertices),
-        np.concatenate(triangles),
-        np.concatenate(uv),
-        np.concatenate(colours),
-        np.concatenate(index),
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.triangles + np.int32(at) for part, at in zip(parts, offsets[:-1], strict=True)]),
+        np.concatenate([part.uv for part in parts]),
+        np.concatenate([part.colours for part in parts]),
+        np.concatenate([lookup[part.texture_index] for part, lookup in zip(parts, lookups, strict=True)]),
         textures,
+        np.concatenate([lookup[index] for index, lookup in zip(without, mask_lookups, strict=True)]) if masks else None,
+        masks,
     )
 
 
@@ -85,3 +79,12 @@ def fan_corners(lengths: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArra
     first = (np.cumsum(lengths) - lengths)[polygons]
     step = np.arange(len(polygons)) - (np.cumsum(each) - each)[polygons]
     return np.stack([first, first + step + 1, first + step + 2], axis=1), polygons
+
+
+def _kept_once(pictures: list[list[NDArray]]) -> tuple[list[NDArray], list[NDArray[np.int32]]]:
+    """All different pictures, and for each list the new indices of its own, -1 staying -1."""
+    every = {id(picture): picture for own in pictures for picture in own}
+    slot = {key: number for number, key in enumerate(every)}
+    return list(every.values()), [
+        np.array([slot[id(picture)] for picture in own] + [-1], dtype=np.int32) for own in pictures
+    ]

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from avp_habitat.errors import SceneError
-from avp_habitat.scenes.files import SUFFIXES
+from avp_habitat.scenes.files import SUFFIXES, broken_link
 
 STAGE_CONFIG = ".stage_config.json"
 Vector = tuple[float, float, float]
@@ -123,17 +123,17 @@ def expect_neutral(layers: Sequence[Layer], key: str, *neutral: Any) -> None:
 
 
 def inside(target: Path, root: Path, told_by: str, value: str) -> Path:
-    """The same path, when it does not leave the data set.
+    """The same path without `..`, when it does not leave the data set.
 
-    Absolute paths are judged by the same rule. Links are followed first, so that a link cannot lead outside either.
+    Absolute paths are judged by the same rule. What counts is the path as it is written: links may lead anywhere.
 
     Raises:
         SceneError: it lies outside of `root`.
     """
     # No file system takes the null character, and asking about one is an error of its own.
-    if "\0" in value or not target.resolve().is_relative_to(root.resolve()):
+    if "\0" in value or not Path(os.path.abspath(target)).is_relative_to(os.path.abspath(root)):
         raise SceneError(f"{told_by}: {value!r} lies outside of {root}, the folder of its data")
-    return target
+    return Path(os.path.normpath(target))
 
 
 def shown(value: Any) -> str:
@@ -151,7 +151,7 @@ def _asset(layers: Sequence[Layer], folder: Path, root: Path, name: str) -> Path
     if asset.suffix.lower() not in SUFFIXES:
         raise SceneError(f"{key}: expected a mesh ({', '.join(SUFFIXES)}), got {shown(value)}")
     if not os.path.isfile(asset):
-        raise SceneError(f"{key}: there is no file {asset}")
+        raise SceneError(f"{key}: {broken_link(asset) or f'there is no file {asset}'}")
     return asset
 
 

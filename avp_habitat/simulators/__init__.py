@@ -68,7 +68,8 @@ def open_simulator(choice: SimulatorChoice, scene: str | Path) -> Simulator:
     choice.check()
     scene = os.fspath(scene)
     path = Path(scene)
-    key = (choice, str(path.resolve()), path.stat().st_mtime) if path.is_file() else (choice, scene, 0.0)
+    # Not where a link leads: what a file refers to lies beside the link.
+    key = (choice, os.path.abspath(path), path.stat().st_mtime) if path.is_file() else (choice, scene, 0.0)
     simulator = _shared.get(key)
     if simulator is None or _is_closed(simulator):
         if choice.name in ONE_PER_PROCESS:

@@ -1,7 +1,7 @@
 """What the task asks of a simulator, and nothing more."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,24 +47,51 @@ class Simulator(Protocol):
     def visible(
         self,
         camera_to_world: NDArray[np.floating],
+        intrinsics: Intrinsics,
         points: NDArray[np.floating],
         pairs: NDArray[np.integer],
         *,
         tolerance_m: float,
     ) -> NDArray[np.bool_]:
-        """Whether camera rays reach points.
+        """Whether cameras see points: inside the image (`poses.in_image`), and reached by the ray through it.
 
         Args:
             camera_to_world: `(n, 4, 4)` habitat poses.
+            intrinsics: of all n cameras.
             points: `(m, 3)` metres, world frame.
-            pairs: `(k, 2)` rows (camera, point); the points are inside those cameras' images.
+            pairs: `(k, 2)` rows (camera, point).
             tolerance_m: a hit this close before the point still reaches it, in metres along the ray.
 
         Returns:
-            `(k,)`.
+            `(k,)`; False for what lies behind a camera or beside its image.
         """
         ...
 
     def close(self) -> None:
         """Free what the simulator holds."""
+        ...
+
+
+@runtime_checkable
+class SingleRays(Simulator, Protocol):
+    """A simulator that casts rays one by one in any direction, beside whole images; ask for it by `isinstance`."""
+
+    def reached(
+        self, eye: NDArray[np.floating], points: NDArray[np.floating], pairs: NDArray[np.integer], *, tolerance_m: float
+    ) -> NDArray[np.bool_]:
+        """Whether rays reach points, whichever way one would have to look.
+
+        Args:
+            eye: `(n, 3)` metres, world frame.
+            points: `(m, 3)` metres, world frame.
+            pairs: `(k, 2)` rows (eye, point).
+            tolerance_m: a hit this close before the point still reaches it, in metres along the ray.
+
+        Returns:
+            `(k,)`; a point nearer than the tolerance is always reached.
+        """
+        ...
+
+    def distance(self, origin: NDArray[np.floating], direction: NDArray[np.floating]) -> NDArray[np.float32]:
+        """`(k,)` metres from `(k, 3)` origins along `(k, 3)` unit directions to the first surface, inf for none."""
         ...

@@ -8,15 +8,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avp_habitat.coverage import pairs_in_image
 from avp_habitat.poses import Intrinsics, pixel_directions
 from avp_habitat.simulators.base import Frames
 
 if TYPE_CHECKING:
     from avp_habitat.navigation.area import NavigableArea
     from avp_habitat.scenes.loader import Scene
+    from avp_habitat.scenes.mesh import TexturedMesh
     from avp_habitat.simulators.shading import Surface
 
 _RAYS_PER_CALL = 1 << 20
+_BEYOND_M = np.float32(1e-4)
+"""How far behind a hole of a surface its rays begin anew, in metres."""
 
 
 class RaycastSimulator:
@@ -39,7 +43,7 @@ class RaycastSimulator:
         self.scene_frame = scene.frame
         self.version = f"open3d {metadata.version('open3d')}"
         self._mesh, self._navmesh = scene.mesh, navmesh
-        self._rays = _Rays(scene.mesh.vertices, scene.mesh.triangles)
+        self._rays = _Rays(scene.mesh)
 
     @property
     def area(self) -> "NavigableArea":
@@ -53,8 +57,11 @@ class RaycastSimulator:
     @cached_property
     def _area(self) -> "NavigableArea":
         from avp_habitat.navigation.area import build_area
+        from avp_habitat.navigation.settings import NavigationSettings
+        from avp_habitat.scenes.masks import without_holes
 
-        own = build_area(self._mesh, self.surface_below)
+        solid = without_holes(self._mesh, NavigationSettings.voxel_m)
+        own = build_area(solid, self.surface_below)
         if self._navmesh is None:
             return own
         from avp_habitat.navigation.islands import area_of_file
@@ -119,23 +126,23 @@ class RaycastSimulator:
     def visible(
         self,
         camera_to_world: NDArray[np.floating],
+        intrinsics: Intrinsics,
         points: NDArray[np.floating],
         pairs: NDArray[np.integer],
         *,
         tolerance_m: float,
     ) -> NDArray[np.bool_]:
-        """Whether camera rays reach points.
+        """Whether cameras see points; see `simulators.base.Simulator.visible`."""
+        seen = pairs_in_image(camera_to_world, intrinsics, points, pairs)
+        eye = np.asarray(camera_to_world)[:, :3, 3]
+        seen[seen] = self.reached(eye, points, pairs[seen], tolerance_m=tolerance_m)
+        return seen
 
-        Args:
-            camera_to_world: `(n, 4, 4)` habitat poses.
-            points: `(m, 3)` metres, world frame.
-            pairs: `(k, 2)` rows (camera, point); the points are inside those cameras' images.
-            tolerance_m: a hit this close before the point still reaches it, in metres along the ray.
-
-        Returns:
-            `(k,)`; a point nearer than the tolerance is always reached.
-        """
-        origin = np.asarray(camera_to_world, dtype=np.float64)[pairs[:, 0], :3, 3]
+    def reached(
+        self, eye: NDArray[np.floating], points: NDArray[np.floating], pairs: NDArray[np.integer], *, tolerance_m: float
+    ) -> NDArray[np.bool_]:
+        """Whether rays reach points in any direction; see `simulators.base.SingleRays.reached`."""
+        origin = np.asarray(eye, dtype=np.float64)[pairs[:, 0]]
         offset = np.asarray(points, dtype=np.float64)[pairs[:, 1]] - origin
         distance = np.sqrt((offset * offset).sum(axis=1))
         far = distance > tolerance_m
@@ -199,23 +206,48 @@ def _camera_rays(poses: NDArray[np.floating], intrinsics: Intrinsics) -> NDArray
 
 
 class _Rays:
-    """Open3D's ray-casting scene with numpy arrays going in and out."""
+    """Open3D's ray-casting scene with numpy arrays going in and out; rays go on through holes of masked surfaces."""
 
-    def __init__(self, vertices: NDArray[np.float32], triangles: NDArray[np.int32]) -> None:
+    def __init__(self, mesh: "TexturedMesh") -> None:
         import open3d
 
+        self._masked = mesh if mesh.masks else None
         self._tensor = open3d.core.Tensor.from_numpy
         self._scene: Any = open3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
-            self._tensor(np.ascontiguousarray(vertices, np.float32)),
-            self._tensor(np.ascontiguousarray(triangles, np.uint32)),
+            self._tensor(np.ascontiguousarray(mesh.vertices, np.float32)),
+            self._tensor(np.ascontiguousarray(mesh.triangles, np.uint32)),
         )
 
     def cast(self, rays: NDArray[np.float32]) -> dict[str, NDArray]:
         """First hits of `(..., 6)` rays: `t_hit` (inf for none), `primitive_ids`, `primitive_uvs`."""
-        hits = self._scene.cast_rays(self._tensor(rays))
-        return {key: hits[key].numpy() for key in ("t_hit", "primitive_ids", "primitive_uvs")}
+        found = self._scene.cast_rays(self._tensor(rays))
+        hits = {key: found[key].numpy() for key in ("t_hit", "primitive_ids", "primitive_uvs")}
+        if self._masked is not None:
+            self._go_on(rays.reshape(-1, 6), *(hits[key].reshape(rays[..., 0].size, -1) for key in hits))
+        return hits
+
+    def _go_on(self, rays: NDArray[np.float32], t_hit: NDArray, ids: NDArray, uvs: NDArray) -> None:
+        """Replace the hits of `(n, 6)` rays in holes by the next ones behind; all have n rows, and change in place."""
+        from avp_habitat.scenes.masks import is_hole
+
+        mesh = self._masked
+        assert mesh is not None
+        through = np.flatnonzero(is_hole(mesh, ids[:, 0], uvs))
+        while len(through):
+            direction = rays[through, 3:]
+            step = _BEYOND_M / np.sqrt((direction * direction).sum(axis=1))
+            gone = np.maximum(t_hit[through, 0] + step, np.nextafter(t_hit[through, 0], np.float32(np.inf)))
+            origin = rays[through, :3] + direction * gone[:, None]
+            found = self._scene.cast_rays(self._tensor(np.concatenate([origin, direction], axis=1)))
+            t_hit[through, 0] = gone + found["t_hit"].numpy()
+            ids[through, 0], uvs[through] = found["primitive_ids"].numpy(), found["primitive_uvs"].numpy()
+            through = through[is_hole(mesh, ids[through, 0], uvs[through])]
 
     def blocked(self, rays: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Whether `(n, 6)` rays hit anything at t <= 1."""
-        return self._scene.test_occlusions(self._tensor(rays), tnear=0.0, tfar=1.0).numpy()
+        blocked = self._scene.test_occlusions(self._tensor(rays), tnear=0.0, tfar=1.0).numpy()
+        if self._masked is not None:
+            doubtful = np.flatnonzero(blocked)
+            blocked[doubtful] = self.cast(rays[doubtful])["t_hit"] <= 1
+        return blocked

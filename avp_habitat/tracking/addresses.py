@@ -5,23 +5,20 @@ import logging
 import os
 import re
 import socket
-import time
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from avp_habitat.errors import AVPError
+from avp_habitat.tracking import database
 from avp_habitat.tracking.locks import alone
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 DEFAULT_ADDRESS = "sqlite:///mlflow.db"
-DEFAULT_EXPERIMENT = "avp"
 _PROBE_S = 5.0
-_ATTEMPTS = 5
-_SQLITE = "sqlite:///"
 
 
 class TrackingError(AVPError):
@@ -59,22 +56,27 @@ def connect(address: str) -> "MlflowClient":
         StoreUnreachableError: the store cannot be reached now.
         TrackingError: MLflow is not installed, or does not know such addresses.
     """
-    problem = unreachable(address)
-    if problem is not None:
+    file = database.file_of(address)
+    if (problem := unreachable(address)) is not None:
         raise StoreUnreachableError(_unusable(address, problem))
+    if file is not None and (problem := database.fault_of(file)) is not None:
+        elsewhere = "name another place, such as MLFLOW_TRACKING_URI=sqlite:////tmp/mlflow.db"
+        raise StoreUnreachableError(f"MLflow at {shown(address)} cannot be used: {problem}; {elsewhere}")
     # A new database otherwise announces that it is made and each of its fifty migrations.
     for name in ("alembic", "mlflow.store.db.utils"):
         logging.getLogger(name).setLevel(logging.WARNING)
     try:
         from mlflow import MlflowClient
 
-        with _one_at_a_time(address):
+        with _one_at_a_time(file):
+            if file is not None and not file.exists():
+                database.make(file)
             client = MlflowClient(address)
             client.search_experiments(max_results=1)
     except ImportError as error:
         raise TrackingError(f"MLflow is asked for but not installed ({error}): pip install mlflow") from None
     except Exception as error:
-        reason = _misunderstood(address, error)
+        reason = _misunderstood(address, file, error)
         if reason is not None:
             raise TrackingError(_unusable(address, reason)) from None
         raise StoreUnreachableError(_unusable(address, first_line(error))) from None
@@ -83,14 +85,17 @@ def connect(address: str) -> "MlflowClient":
 
 def absolute(address: str) -> str:
     """An address that means the same in every folder."""
-    if address.startswith(_SQLITE):
-        return f"{_SQLITE}{Path(address.removeprefix(_SQLITE)).absolute()}"
+    file = database.file_of(address)
+    if file is not None:
+        options = address.partition("?")[1:]
+        return f"{database.SQLITE}{file}{''.join(options)}"
     return address if urlsplit(address).scheme else str(Path(address).absolute())
 
 
 def is_missing(address: str) -> bool:
     """Whether an address names a database file that does not exist, which MLflow would make."""
-    return address.startswith(_SQLITE) and not Path(address.removeprefix(_SQLITE)).exists()
+    file = database.file_of(address)
+    return file is not None and not file.exists()
 
 
 def unreachable(address: str) -> str | None:
@@ -119,9 +124,11 @@ def first_line(error: BaseException) -> str:
     return of_database[1] if of_database else text.partition("\n")[0] or repr(error)
 
 
-def _misunderstood(address: str, error: Exception) -> str | None:
+def _misunderstood(address: str, file: Path | None, error: Exception) -> str | None:
     """What is wrong with an address that can never work; None for another error."""
     line = first_line(error)
+    if file is not None and re.search("already exists|duplicate column", line):
+        return database.half_made(file)
     if "MLFLOW_ALLOW_FILE_STORE" in line:
         return "MLflow 3 keeps runs in a folder only when the variable MLFLOW_ALLOW_FILE_STORE=true is set"
     if "unsupported URI" in line:
@@ -130,39 +137,9 @@ def _misunderstood(address: str, error: Exception) -> str | None:
     return None
 
 
-def _one_at_a_time(address: str) -> AbstractContextManager[None]:
-    """Keeps other programs from making the same sqlite database at the same time, which would leave it half-made."""
-    if not address.startswith(_SQLITE):
-        return nullcontext()
-    path = Path(address.removeprefix(_SQLITE)).absolute()
-    return alone(f"mlflow-{hashlib.sha256(os.fsencode(path)).hexdigest()[:16]}")
-
-
-def experiment_id(client: "MlflowClient", name: str) -> tuple[str, bool]:
-    """The id of an experiment, which is made, with its views, when it does not exist; whether it was made now.
-
-    Raises:
-        MlflowException: the store refuses.
-    """
-    from mlflow.exceptions import MlflowException
-
-    from avp_habitat.tracking.view import prepare_experiment
-
-    for attempt in range(_ATTEMPTS):
-        found = client.get_experiment_by_name(name)
-        if found is not None:
-            return found.experiment_id, False
-        try:
-            identity = client.create_experiment(name)
-        except MlflowException:
-            # Another process may have been faster.
-            if attempt == _ATTEMPTS - 1:
-                raise
-            time.sleep(0.1)
-        else:
-            prepare_experiment(client, identity)
-            return identity, True
-    raise AssertionError
+def _one_at_a_time(file: Path | None) -> AbstractContextManager[None]:
+    """Keeps other programs from making the same database at the same time."""
+    return nullcontext() if file is None else alone(f"mlflow-{hashlib.sha256(os.fsencode(file)).hexdigest()[:16]}")
 
 
 def _unusable(address: str, problem: str) -> str:

@@ -12,9 +12,9 @@ from urllib.parse import urlsplit
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
+from avp_habitat.metrics import explained
 from avp_habitat.tracking.addresses import (
     DEFAULT_ADDRESS,
-    DEFAULT_EXPERIMENT,
     TrackingError,
     address_of,
     connect,
@@ -32,17 +32,21 @@ from avp_habitat.tracking.comparison import (
     markdown,
     picture,
 )
+from avp_habitat.tracking.experiments import DEFAULT_HELP, find_experiment, meant
 from avp_habitat.tracking.view import MODEL_TRAINING, prepare_experiment
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
+    from mlflow.entities import Experiment
 
 TABLE, MARKDOWN, PICTURE = "comparison.json", "comparison.md", "comparison.png"
 NAME = "comparison"
 _NOTE = "mlflow.note.content"
 _MAX_TAG = 5000
-_HOW_TO_READ = """
+_HOW_TO_READ = f"""
 More PSNR and SSIM are better, less LPIPS; fewer views are better. Means over the runs; ± is half of the 95 % interval.
+
+{explained("coverage", "CpV", "visibility", "PSNR", "SSIM", "LPIPS")}.
 """
 
 
@@ -53,7 +57,7 @@ def _parser() -> argparse.ArgumentParser:
         "table, and keep it in the experiment as the run 'comparison', which is made once and then renewed.",
     )
     add = parser.add_argument
-    add("--experiment", default=DEFAULT_EXPERIMENT, metavar="NAME", help="of MLflow (default: %(default)s)")
+    add("--experiment", metavar="NAME", help=f"of MLflow (default: {DEFAULT_HELP})")
     add(
         "--mlflow",
         default="auto",
@@ -87,15 +91,15 @@ def main(argv: Sequence[str]) -> None:
         methods = _methods(client, experiment, options)
         table = markdown(methods)
         print(table)
-        run = keep(client, experiment, methods)
-        prepare_experiment(client, experiment)
+        run = keep(client, experiment.experiment_id, methods)
+        prepare_experiment(client, experiment.experiment_id)
     except MlflowException as error:
         raise TrackingError(f"MLflow at {shown(options.address)} does not answer: {first_line(error)}") from None
     if options.out is not None:
         _publish(options.out, methods)
         print(f"files:   {options.out}")
-    print(f"MLflow:  run {run} in experiment {options.experiment!r} at {shown(options.address)}")
-    print(f"look:    {_look(options.address, experiment, run)}")
+    print(f"MLflow:  run {run} in experiment {experiment.name!r} at {shown(options.address)}")
+    print(f"look:    {_look(options.address, experiment.experiment_id, run)}")
 
 
 def keep(client: "MlflowClient", experiment_id: str, methods: Sequence[Method]) -> str:
@@ -146,19 +150,20 @@ def _kept(client: "MlflowClient", experiment_id: str, scenes: str) -> str | None
     return next((run.info.run_id for run in found if run.data.tags.get(SCENE_TAG) == scenes), None)
 
 
-def _experiment(client: "MlflowClient", name: str) -> str:
-    found = client.get_experiment_by_name(name)
-    if found is None or found.lifecycle_stage != "active":
+def _experiment(client: "MlflowClient", option: str | None) -> "Experiment":
+    name, identity = meant(option)
+    found = find_experiment(client, name, identity)
+    if found is None:
         known = [experiment.name for experiment in client.search_experiments()]
-        raise UsageError(f"--experiment: {unknown_name('experiment', name, known)}")
-    return found.experiment_id
+        raise UsageError(f"--experiment: {unknown_name('experiment', str(name), known)}")
+    return found
 
 
-def _methods(client: "MlflowClient", experiment_id: str, options: argparse.Namespace) -> list[Method]:
-    runs = collect_runs(client, experiment_id)
+def _methods(client: "MlflowClient", experiment: "Experiment", options: argparse.Namespace) -> list[Method]:
+    runs = collect_runs(client, experiment.experiment_id)
     if not runs:
         raise AVPError(
-            f"experiment {options.experiment!r} at {shown(options.address)} has no run with eval/coverage, eval/views "
+            f"experiment {experiment.name!r} at {shown(options.address)} has no run with eval/coverage, eval/views "
             "and the tag avp.policy; such runs are made by python -m avp_sb3.evaluate, ns-train avp-nerfacto and "
             "python -m avp_nerfstudio.log"
         )

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
+from avp_habitat.errors import AVPError
 from avp_habitat.tracking.addresses import (
-    DEFAULT_EXPERIMENT,
     TrackingError,
     absolute,
     connect,
@@ -16,6 +16,7 @@ from avp_habitat.tracking.addresses import (
     shown,
 )
 from avp_habitat.tracking.early import open_store
+from avp_habitat.tracking.experiments import meant
 from avp_habitat.tracking.journal import VERSION, Journal, spool_folder
 from avp_habitat.tracking.remote import OFFLINE, create, existing_run, find_run, reopen
 from avp_habitat.tracking.run import TrackedRun
@@ -30,10 +31,10 @@ _OPTION = "offline=True"
 class NewRun:
     """What a run is made from."""
 
-    experiment: str = DEFAULT_EXPERIMENT
-    """Made when it does not exist."""
+    experiment: str | None = None
+    """Made when it does not exist; as `experiments.meant` says when None."""
     name: str | None = None
-    """Of the run; MLflow invents one when None."""
+    """Of the run; MLflow invents one when None, the same one after each training that was seeded alike."""
     tags: Mapping[str, str] = field(default_factory=dict)
     """Beside those of MLflow's run context."""
     parent: str | None = None
@@ -59,8 +60,10 @@ def start_run(
     from mlflow.tracking.context.registry import resolve_tags
 
     client = open_store(address, offline=offline, option=_OPTION)
+    experiment, experiment_id = meant(new.experiment)
     header = _header(address) | {
-        "experiment": new.experiment,
+        "experiment": experiment,
+        "experiment_id": experiment_id,
         "name": new.name,
         "tags": resolve_tags() | dict(new.tags),
         "parent": new.parent,
@@ -75,7 +78,7 @@ def start_run(
             pass  # The journal says itself that the disk takes nothing.
         except BaseException as error:
             journal.remove()
-            if not isinstance(error, Exception):
+            if isinstance(error, AVPError) or not isinstance(error, Exception):
                 raise
             raise TrackingError(f"MLflow at {shown(address)} did not take the run: {first_line(error)}") from error
     return TrackedRun(journal, client, **options)

@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from avp_habitat.tracking.addresses import TrackingError, experiment_id, shown
+from avp_habitat.tracking.addresses import TrackingError, shown
+from avp_habitat.tracking.experiments import experiment_id
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -48,12 +49,12 @@ def create(client: "MlflowClient", header: Mapping[str, Any]) -> str:
 
     Args:
         client: of the store.
-        header: of the journal: `key`, `experiment`, `name`, `tags`, `parent` and `started_ms`.
+        header: of the journal: `key`, `experiment`, `experiment_id`, `name`, `tags`, `parent` and `started_ms`.
     """
     earlier = _of_key(client, header["key"]) if header.get("creating") else None
     if earlier is not None:
         return earlier.info.run_id
-    identity, _ = experiment_id(client, header["experiment"])
+    identity, _ = experiment_id(client, header["experiment"], header.get("experiment_id"))
     tags = {**header["tags"], KEY_TAG: header["key"]}
     parent = find_run(client, header.get("parent"))
     # MLflow nests runs within one experiment only.

@@ -55,6 +55,21 @@ def origin(meta: Mapping[str, Any]) -> dict[str, str]:
     return tags | ({COLOUR_TAG: run_colour(str(leaves["policy.name"]))} if leaves.get("policy.name") else {})
 
 
+def title(meta: Mapping[str, Any]) -> str | None:
+    """Policy, scene and seed, in words; the reward too of a policy that was trained. None where a rollout has no names.
+
+    Args:
+        meta: `rollout.json`.
+    """
+    named = origin(meta)
+    if not {POLICY_TAG, SCENE_TAG} <= named.keys():
+        return None
+    policy, seed = named[POLICY_TAG], meta.get("seed")
+    words = [policy, meta.get("reward") if policy.endswith(".zip") else None, named[SCENE_TAG]]
+    words += [None if seed is None else f"seed {seed}"]
+    return " ".join(str(word) for word in words if word is not None)
+
+
 def rollout_params(meta: Mapping[str, Any]) -> dict[str, str]:
     """`rollout.seed`, `rollout.budget`, ...: what a rollout was collected with.
 

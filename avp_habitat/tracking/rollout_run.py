@@ -10,20 +10,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from avp_habitat import command
-from avp_habitat.errors import AVPError, RolloutError, UsageError
-from avp_habitat.rollout import read_meta
+from avp_habitat.errors import AVPError, UsageError
+from avp_habitat.rollout import read_rollout
 from avp_habitat.tracking import rollout_facts as facts
 from avp_habitat.tracking.addresses import (
     DEFAULT_ADDRESS,
-    DEFAULT_EXPERIMENT,
     TrackingError,
     address_of,
     connect,
-    experiment_id,
     first_line,
     shown,
     unreachable,
 )
+from avp_habitat.tracking.experiments import DEFAULT_HELP, experiment_id, meant
 from avp_habitat.tracking.locks import alone
 from avp_habitat.tracking.looking import how_to_look
 from avp_habitat.tracking.remote import PARENT_TAG, find_run
@@ -45,7 +44,7 @@ def rollout_run(store: "MlflowClient | str", folder: str | Path, *, experiment: 
     Args:
         store: its client, or its address.
         folder: of the rollout, or its `rollout.json`.
-        experiment: of a rollout whose policy's run the store does not have; `avp` when omitted.
+        experiment: of a rollout whose policy's run the store does not have; as `experiments.meant` says when omitted.
 
     Returns:
         The run's id.
@@ -91,9 +90,8 @@ class _Rollout:
     @property
     def name(self) -> str:
         """Of the run."""
-        origin = facts.origin(self.meta)
-        who = [origin[tag] for tag in (facts.POLICY_TAG, facts.SCENE_TAG) if tag in origin]
-        return " ".join([facts.ROLLOUT, *who]) if len(who) == 2 else self.folder.resolve().name
+        title = facts.title(self.meta)
+        return self.folder.resolve().name if title is None else f"{facts.ROLLOUT} {title}"
 
     def tags(self) -> dict[str, str]:
         """Versions are those of the programs that collected it, which need not be the ones of this process."""
@@ -114,11 +112,8 @@ class _Rollout:
 
 
 def _read(folder: Path) -> _Rollout:
-    if folder.name == "rollout.json":
-        folder = folder.parent
-    if not folder.is_dir():
-        raise RolloutError(f"{folder}: expected a rollout folder (made by `python -m avp_habitat.collect`), found none")
-    meta = read_meta(folder)
+    rollout = read_rollout(folder)
+    folder, meta = rollout.folder, rollout.meta
     return _Rollout(folder, meta, facts.rollout_id(folder), facts.policy_run_id(folder, meta))
 
 
@@ -134,7 +129,7 @@ def _made(client: "MlflowClient", rollout: _Rollout, policy: "Run | None", exper
     if policy is not None:
         identity = policy.info.experiment_id
     else:
-        identity, _ = experiment_id(client, experiment or DEFAULT_EXPERIMENT)
+        identity, _ = experiment_id(client, *meant(experiment))
     ours = client.create_run(identity, run_name=rollout.name, tags=rollout.tags())
     _fill(client, ours.info.run_id, rollout)
     # MLflow cannot make a run only if there is none: a program on another machine may have made it meanwhile, too.
@@ -231,7 +226,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--experiment",
         metavar="NAME",
-        help=f"MLflow experiment of rollouts whose policy's run is not there (default: {DEFAULT_EXPERIMENT})",
+        help=f"MLflow experiment of rollouts whose policy's run is not there (default: {DEFAULT_HELP})",
     )
     return parser
 

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from avp_habitat.metrics import TERMS
+
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
@@ -34,6 +36,19 @@ _COLOURS = {
 }
 _MODEL_COLOURS = ("#d62728", "#ff7f0e", "#2ca02c", "#a55194", "#637939", "#843c39", "#e7969c", "#e7ba52")
 _LOG = logging.getLogger(__name__)
+_TERM_OF = (
+    ("views", "views", "; fewer is better"),
+    ("coverage", "coverage", ", 0 to 1"),
+    ("cpv", "CpV", ", in percent"),
+    ("ei", "EI", ""),
+    ("annd_m", "ANND", ", in metres"),
+    ("redundant_views", "redundant views", ""),
+    ("visibility", "visibility", ", 0 to 1"),
+    ("psnr", "PSNR", ""),
+    ("ssim", "SSIM", ""),
+    ("lpips", "LPIPS", ""),
+)
+"""Metric, its term, and what else there is to say of the number."""
 MODEL_TRAINING = "workflowType=machine_learning"
 """Parameter of an address: MLflow 3.17 shows pages of traces first to a browser that has never been there."""
 
@@ -274,11 +289,13 @@ Which policy gives the better reconstruction for fewer views? [**Table**]({table
 More views: [evaluations, coverage by view]({path_of(experiment_id, EVALUATIONS, charts=True)}), \
 [trainings by environment step]({path_of(experiment_id, TRAININGS, charts=True)}). All are in the menu *Views*, too.
 
-- `eval/views`: pictures taken; fewer is better.
-- `eval/coverage`: share of the floor that was seen, 0 to 1.
-- `eval/psnr` (dB, more is better), `eval/ssim` (more), `eval/lpips` (less): the reconstruction against views that \
-it never saw.
+{_terms()}
 - `avp.policy`, `avp.scene`: who took the pictures, and where.
 
 A table of the means by policy: `python -m avp_habitat.tracking.compare`, then the run *comparison*.
 """
+
+
+def _terms() -> str:
+    """A line for each metric that has a term."""
+    return "\n".join(f"- `eval/{name}`: {TERMS[term]}{more}" for name, term, more in _TERM_OF)

@@ -19,6 +19,7 @@ from avp_habitat.simulators.options import add_up_option
 from avp_nerfstudio.check.outputs import choose_folder, outputs_of_geometry, write_outputs
 from avp_nerfstudio.check.shape import check_format
 from avp_nerfstudio.check.verdict import Verdict
+from avp_nerfstudio.foreign import check_is_rollout
 
 
 class CheckFailedError(AVPError):
@@ -66,7 +67,7 @@ def check(request: Request) -> list[Verdict]:
     geometry = _with_bar(check_geometry, rollout, scene)
     if not verdict.passed and geometry.diagnosis is not None:
         verdict = replace(verdict, cause=geometry.diagnosis.cause)
-    verdicts = [verdict, *geometry.verdicts, *_pictures(rollout, request)]
+    verdicts = [verdict, *geometry.verdicts, *_pictures(rollout, request, geometry.proved)]
     write_outputs(request.out, request.rollout, verdicts, outputs_of_geometry(rollout, geometry, verdicts))
     return verdicts
 
@@ -85,8 +86,11 @@ def _with_bar(check_geometry: Any, rollout: Rollout, scene: Scene | None) -> Any
         return check_geometry(rollout, scene, progress=bar.update)
 
 
-def _pictures(rollout: Rollout, request: Request) -> list[Verdict]:
-    """The verdicts of the pictures; the matches that they need serve the COLMAP model too."""
+def _pictures(rollout: Rollout, request: Request, proved: Any) -> list[Verdict]:
+    """The verdicts of the pictures; the matches that they need serve the COLMAP model too.
+
+    `proved` is an `(n,)` mask of the frames, perhaps with more after them, whose poses the depth proves right.
+    """
     if not request.pictures and request.export_colmap is None:
         return []
     try:
@@ -98,7 +102,7 @@ def _pictures(rollout: Rollout, request: Request) -> list[Verdict]:
             f"checking the pictures needs {error.name}: pip install {error.name}, or leave it out with --no-pictures"
         ) from None
     matches = match_pictures(rollout)
-    verdicts = check_pictures(rollout, matches=matches) if request.pictures else []
+    verdicts = check_pictures(rollout, matches=matches, proved=proved) if request.pictures else []
     if request.export_colmap is not None:
         print(f"COLMAP model: {export_colmap(rollout, request.export_colmap, matches=matches)}")
     return verdicts
@@ -131,6 +135,7 @@ def _request(argv: Sequence[str]) -> Request:
     folder = options.rollout.parent if options.rollout.name == "rollout.json" else options.rollout
     if not folder.is_dir():
         raise UsageError(f"{folder}: expected a rollout folder (made by `python -m avp_habitat.collect`), found none")
+    check_is_rollout(folder)
     if options.export_colmap is not None and options.export_colmap.exists():
         raise UsageError(f"--export-colmap {options.export_colmap}: exists already, expected a new folder")
     return Request(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.poses import Intrinsics, camera_to_world, habitat_to_opencv, yaw_and_pitch
 from avp_habitat.rollout import HELDOUT, Rollout, frame_name, read_rollout
+from avp_nerfstudio.check.registration import rotation_matrix
 
 Float = NDArray[np.floating]
 
@@ -29,16 +30,37 @@ class Written:
     """Of all."""
 
 
+Damage = Callable[[Written, np.random.Generator], Written]
+"""What a fault does to a correct rollout; the generator chooses frames and directions."""
+
+
 @dataclass(frozen=True)
 class Fault:
     """A deliberate fault."""
 
     name: str
     """For tables."""
-    damage: Callable[[Written, np.random.Generator], Written]
+    damage: Damage
     """Makes it."""
     named: str
     """A regular expression that the cause found must match."""
+
+
+def damaged(rollout: Rollout, fault: Fault, *, seed: int = 0) -> Rollout:
+    """A rollout with a fault in its poses and intrinsics; its files are as they were.
+
+    Args:
+        rollout: a correct one.
+        fault: which one.
+        seed: of faults that choose frames or directions.
+    """
+    right = Written(_stack(rollout, heldout=False), _stack(rollout, heldout=True), rollout.intrinsics)
+    wrong = fault.damage(right, np.random.default_rng(seed))
+    frames, heldout = (
+        [replace(view, camera_to_world=pose) for view, pose in zip(views, poses, strict=True)]
+        for views, poses in ((rollout.frames, wrong.frames), (rollout.heldout, wrong.heldout))
+    )
+    return replace(rollout, frames=frames, heldout=heldout, intrinsics=wrong.intrinsics)
 
 
 def write_faulty(source: str | Path, target: Path, fault: Fault, *, seed: int = 0) -> Path:
@@ -54,8 +76,8 @@ def write_faulty(source: str | Path, target: Path, fault: Fault, *, seed: int = 
         seed: of faults that choose frames or directions.
     """
     rollout = read_rollout(source)
-    right = Written(_stack(rollout, heldout=False), _stack(rollout, heldout=True), rollout.intrinsics)
-    wrong = fault.damage(right, np.random.default_rng(seed))
+    made = damaged(rollout, fault, seed=seed)
+    wrong = Written(_stack(made, heldout=False), _stack(made, heldout=True), made.intrinsics)
     shutil.copytree(rollout.folder, target, copy_function=_link)
     for base, poses in ((target, wrong.frames), (target / HELDOUT, wrong.heldout)):
         for index, pose in enumerate(poses):
@@ -118,7 +140,7 @@ def _rewrite_steps(path: Path, poses: Float, meta: dict[str, Any]) -> None:
         writer.writerows(rows)
 
 
-def _of_all(change: Callable[[Float], Float]) -> Callable[[Written, np.random.Generator], Written]:
+def _of_all(change: Callable[[Float], Float]) -> Damage:
     """A fault that changes all poses alike."""
     return lambda right, _: replace(right, frames=change(right.frames), heldout=change(right.heldout))
 
@@ -145,9 +167,12 @@ def _radians_for_degrees(poses: Float) -> Float:
     return camera_to_world(poses[:, :3, 3], yaw=yaw, pitch=np.radians(pitch))
 
 
-def _focal(right: Written, _: np.random.Generator) -> Written:
-    k = right.intrinsics
-    return replace(right, intrinsics=replace(k, fx=1.03 * k.fx, fy=1.03 * k.fy))
+def _focal(percent: float) -> Damage:
+    def damage(right: Written, _: np.random.Generator) -> Written:
+        k, factor = right.intrinsics, 1 + percent / 100
+        return replace(right, intrinsics=replace(k, fx=factor * k.fx, fy=factor * k.fy))
+
+    return damage
 
 
 def _swapped(right: Written, _: np.random.Generator) -> Written:
@@ -164,11 +189,18 @@ def _exchanged(right: Written, rng: np.random.Generator) -> Written:
     return replace(right, frames=frames)
 
 
-def _off(right: Written, rng: np.random.Generator) -> Written:
-    frames = right.frames.copy()
-    direction = rng.normal(size=3)
-    frames[rng.integers(len(frames)), :3, 3] += 0.05 * direction / np.linalg.norm(direction)
-    return replace(right, frames=frames)
+def _off(distance_m: float, turn_deg: float) -> Damage:
+    """One pose moved and turned, in random directions."""
+
+    def damage(right: Written, rng: np.random.Generator) -> Written:
+        frames = right.frames.copy()
+        shift, axis = (direction / np.linalg.norm(direction) for direction in rng.normal(size=(2, 3)))
+        frame = rng.integers(len(frames))
+        frames[frame, :3, 3] += distance_m * shift
+        frames[frame, :3, :3] = rotation_matrix(np.radians(turn_deg) * axis) @ frames[frame, :3, :3]
+        return replace(right, frames=frames)
+
+    return damage
 
 
 def _shifted(right: Written, _: np.random.Generator) -> Written:
@@ -180,11 +212,11 @@ FAULTS = (
     Fault("y and z axes flipped", _of_all(habitat_to_opencv), "opencv written as habitat: y and z flipped"),
     Fault("rotations transposed", _of_all(_transposed), "rotations look transposed"),
     Fault("world-to-camera", _of_all(np.linalg.inv), r"look like world_to_camera: expected"),
-    Fault("focal length 3 % too long", _focal, r"focal length is [23]\.\d % too long"),
+    Fault("focal length 3 % too long", _focal(3), r"focal length is [23]\.\d % too long"),
     Fault("width and height swapped", _swapped, "width and height look swapped"),
     Fault("scale x 1.1", _of_all(_scaled), r"positions are 1\.1\d* times too large"),
     Fault("two poses exchanged", _exchanged, r"the poses of frame \d+ and frame \d+ are exchanged"),
-    Fault("one pose 5 cm off", _off, r"pose of frame \d+ is off"),
+    Fault("one pose 5 cm off", _off(0.05, 0), r"pose of frame \d+ is off"),
     Fault("time shift of one frame", _shifted, "shifted in time by 1 frame: each frame has the pose of the next"),
     Fault("pitch: degrees taken for radians", _of_all(_degrees_for_radians), "pitch in degrees was taken for radians"),
 )
@@ -198,3 +230,9 @@ MORE_FAULTS = (
     ),
 )
 """Further ones, which are named too."""
+SMALL_FAULTS = (
+    *(Fault(f"one pose {cm} cm off", _off(cm / 100, 0), r"pose of frame \d+") for cm in (2, 5, 10)),
+    *(Fault(f"one pose {deg:g}° off", _off(0, deg), r"pose of frame \d+") for deg in (0.5, 1, 2)),
+    *(Fault(f"focal length {percent} % too long", _focal(percent), "focal length") for percent in (1, 2, 3)),
+)
+"""Faults of one frame or of the focal length by growing amounts, to measure from where on they are seen."""

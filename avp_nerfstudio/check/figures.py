@@ -12,7 +12,9 @@ from avp_nerfstudio.check.verdict import Verdict
 _ABOVE_CAMERAS_M = 0.3
 _MOST_POINTS = 150_000
 _OUTLIERS = 0.5
-_GROUND = "#30343a"
+_GROUND = "#f4f4f2"
+_POINT = 4.0
+"""Area of a point, square typographic points: so large that surfaces close and hide what lies behind them."""
 
 
 def draw_overview(path: Path, cloud: Cloud, cameras: Cameras, bad: NDArray[np.bool_], verdicts: list[Verdict]) -> None:
@@ -35,15 +37,16 @@ def draw_overview(path: Path, cloud: Cloud, cameras: Cameras, bad: NDArray[np.bo
     below = points[:, 1] < centres[:, 1].max() + _ABOVE_CAMERAS_M
     lines, line_colours = frusta(cameras), frustum_colours(bad) / 255
     figure = Figure(figsize=(14, 6.5), layout="constrained")
+    behind = points[:, 2] < np.median(centres[:, 2])
     for axes, (across, along), towards, chosen, title in (
-        (*_pair(figure, 0), 1, below, "from above"),
-        (*_pair(figure, 1), 2, np.ones(len(points), bool), "from the side"),
+        (*_pair(figure, 0), 1, below, "from above, without the ceiling"),
+        (*_pair(figure, 1), 2, behind, "from the side, without the nearer half"),
     ):
         order = np.flatnonzero(chosen)[np.argsort(points[chosen, towards])]
         axes.scatter(
-            points[order, across], points[order, along], s=0.6, c=colours[order], linewidths=0, rasterized=True
+            points[order, across], points[order, along], s=_POINT, c=colours[order], linewidths=0, rasterized=True
         )
-        axes.add_collection(LineCollection(list(lines[:, :, [across, along]]), colors=line_colours, linewidths=0.8))
+        axes.add_collection(LineCollection(list(lines[:, :, [across, along]]), colors=line_colours, linewidths=0.6))
         axes.set_aspect("equal")
         axes.set_xlabel(f"{'xyz'[across]} [m]")
         axes.set_ylabel(f"{'xyz'[along]} [m]")

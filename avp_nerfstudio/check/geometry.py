@@ -50,6 +50,8 @@ class Geometry:
     """The rollout's own."""
     bad: NDArray[np.bool_]
     """`(n,)` frames that disagree."""
+    proved: NDArray[np.bool_]
+    """`(n,)` frames that agree, and whose surfaces fix all six directions in which their poses could be off."""
     diagnosis: Diagnosis | None
     """What explains the disagreement, where that is known."""
 
@@ -68,28 +70,37 @@ def name_of(cameras: Cameras, frame: int) -> str:
 
 
 def check_geometry(
-    rollout: Rollout, scene: Scene | None = None, *, progress: Callable[[], object] = lambda: None
+    rollout: Rollout,
+    scene: Scene | None = None,
+    *,
+    maps: DepthMaps | None = None,
+    explain: bool = True,
+    progress: Callable[[], object] = lambda: None,
 ) -> Geometry:
     """Compare all depth pictures of a rollout with each other and, if given, with the scene.
 
     Args:
         rollout: at least one frame.
         scene: the mesh it was captured in.
+        maps: its depth, where it was read already.
+        explain: also look for the mistake behind a disagreement, and for mistakes that would not show.
         progress: called after each picture that was read.
 
     Raises:
         RolloutError: a depth picture cannot be decoded.
     """
     given = cameras_of(rollout)
-    maps = load_depth_maps(rollout.frames + rollout.heldout, rollout.intrinsics, progress=progress)
+    maps = maps or load_depth_maps(rollout.frames + rollout.heldout, rollout.intrinsics, progress=progress)
     comparison = Comparison(maps)
     agreement = comparison.full(given)
     bad = bad_frames(agreement, given.kept)
     passed = agrees(agreement, given.kept)
     corrections = _corrections(comparison, given, agreement, bad)
-    diagnosis = None if passed else _diagnose(comparison, given, rollout, bad, corrections)
+    proved = _proved(agreement, given, corrections) & ~bad
+    diagnosis = None if passed or not explain else _diagnose(comparison, given, rollout, bad, corrections)
+    hidden = _hidden_mistakes(comparison, given) if passed and explain else []
     verdicts = [
-        _agreement_verdict(comparison, given, agreement, bad, passed),
+        _agreement_verdict(given, agreement, bad, passed, hidden),
         _correction_verdict(given, corrections),
     ]
     if scene is not None:
@@ -97,7 +108,7 @@ def check_geometry(
         measured = mesh_distance(maps, given, scene, named=named.get("sha256") if isinstance(named, dict) else None)
         verdicts.append(measured.verdict)
         bad = bad | measured.bad
-    return Geometry([_with_cause(v, diagnosis, given, bad) for v in verdicts], maps, given, bad, diagnosis)
+    return Geometry([_with_cause(v, diagnosis, given, bad) for v in verdicts], maps, given, bad, proved, diagnosis)
 
 
 def _diagnose(
@@ -116,6 +127,18 @@ def _diagnose(
     if found is None and 0 < len(numbers) <= max(_FEW, 0.25 * len(bad)):
         found = frame_mistake(comparison, given, numbers, corrections=corrections, name=partial(name_of, given))
     return found
+
+
+def _proved(agreement: Agreement, given: Cameras, corrections: dict[int, Correction | None]) -> NDArray[np.bool_]:
+    share, compared = agreement.per_frame(given.kept)
+    fixed = np.zeros(len(given.poses), bool)
+    for frame, correction in corrections.items():
+        fixed[frame] = correction is not None and correction.fixed_directions == 6 and _small(correction)
+    return fixed & (compared >= LEAST_COMPARED) & (share >= AGREEING_SHARE_OF_FRAME)
+
+
+def _small(correction: Correction) -> bool:
+    return correction.distance_m <= CORRECTION_M and correction.rotation_deg <= CORRECTION_DEG
 
 
 def _corrections(
@@ -149,7 +172,7 @@ def _correction(
 
 
 def _agreement_verdict(
-    comparison: Comparison, given: Cameras, agreement: Agreement, bad: NDArray[np.bool_], passed: bool
+    given: Cameras, agreement: Agreement, bad: NDArray[np.bool_], passed: bool, hidden: list[str]
 ) -> Verdict:
     share, compared = agreement.per_frame(given.kept)
     judged = compared >= LEAST_COMPARED
@@ -171,7 +194,6 @@ def _agreement_verdict(
         f"(limit {100 * AGREEING_SHARE} %); worst is {name_of(given, worst)} with {100 * share[worst]:.1f} % "
         f"(limit {100 * AGREEING_SHARE_OF_FRAME:.0f} %)"
     )
-    hidden = _hidden_mistakes(comparison, given) if passed else []
     if hidden:
         text += f"; these views cannot show {', '.join(hidden)}"
     return Verdict("depth agreement", passed, text, figures)
@@ -206,7 +228,7 @@ def _correction_verdict(given: Cameras, corrections: dict[int, Correction | None
         return Verdict("ICP correction", True, "no frame could be registered to others")
     worst = max(found, key=lambda frame: max(found[frame].distance_m / CORRECTION_M, found[frame].rotation_deg))
     shift, turn = found[worst].distance_m, found[worst].rotation_deg
-    wrong = [f for f, c in found.items() if c.distance_m > CORRECTION_M or c.rotation_deg > CORRECTION_DEG]
+    wrong = [f for f, c in found.items() if not _small(c)]
     text = (
         f"ICP would improve {len(wrong)} of {len(found)} frames by more than {1000 * CORRECTION_M:.0f} mm or "
         f"{CORRECTION_DEG} degrees (limit 0)"

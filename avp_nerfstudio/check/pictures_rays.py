@@ -12,14 +12,6 @@ Float = NDArray[np.floating]
 
 # Nothing that a frame shows well is nearer than this: it bounds where a feature of one picture can lie in another.
 NEAREST_M = 0.2
-# Measured on an 80-frame walk of the white room: with these a frame that is 5 cm off had the greatest error of all in
-# 20 of 20 trials (1.0 px or more against at most 0.3 px); with turns on the spot or all pairs counted, in 10 of 20.
-APART_M = 0.1
-RICHEST_PAIRS = 5
-MIN_STEREO_PAIRS = 2
-# The boards of the rooms' floors repeat: such pairs had up to 417 matches that fit one epipolar geometry, and errors
-# from 36 px; where a walk begins by turning on the spot, they are the only pairs whose cameras stand apart.
-FALSE_PX = 20.0
 
 
 @dataclass(frozen=True)
@@ -99,35 +91,6 @@ def pair_medians(stacked: Stacked, errors: Float) -> Float:
     return np.array(
         [np.median(errors[start:end]) for start, end in zip(stacked.start[:-1], stacked.start[1:], strict=True)]
     )
-
-
-def frame_errors(stacked: Stacked, poses: Float, intrinsics: Intrinsics) -> Float:
-    """How badly each picture's own pose fits, in pixels: the greater of two medians over its pairs' medians.
-
-    One is over its richest pairs of all, mostly neighbours in the walk, and shows gross faults. The other is over the
-    richest pairs whose cameras stand apart, because a turn on the spot hides a wrong position; there, pairs with
-    errors beyond `FALSE_PX` are left out, because a repeating floor or wallpaper makes pairs that match falsely.
-
-    Args:
-        stacked: the matches.
-        poses: `(n, 4, 4)` camera_to_world, habitat axes.
-        intrinsics: of all pictures.
-
-    Returns:
-        `(n,)`, NaN for a picture without pairs.
-    """
-    medians = pair_medians(stacked, ray_errors(stacked, poses, intrinsics))
-    apart = np.linalg.norm(poses[stacked.first, :3, 3] - poses[stacked.second, :3, 3], axis=-1) >= APART_M
-    errors = np.full(len(poses), np.nan)
-    richest = np.argsort(-stacked.count)
-    for picture in range(len(poses)):
-        own = richest[(stacked.first[richest] == picture) | (stacked.second[richest] == picture)]
-        stereo = own[apart[own] & (medians[own] < FALSE_PX)]
-        if len(own):
-            errors[picture] = np.median(medians[own[:RICHEST_PAIRS]])
-        if len(stereo) >= MIN_STEREO_PAIRS:
-            errors[picture] = max(errors[picture], np.median(medians[stereo[:RICHEST_PAIRS]]))
-    return errors
 
 
 def _angle(a: Float, b: Float) -> Float:

@@ -312,12 +312,13 @@ def test_visible_cells_are_those_that_rays_reach(opened):
     poses, points = poses_in(reference.area, 40), simulator.area.centres
     camera = Intrinsics.from_hfov(640, 480, hfov_deg=90)
     pairs = candidates(poses, camera, points, np.ones((len(poses), len(points)), bool), max_range_m=10)
-    seen, expected = (each.visible(poses, points, pairs, tolerance_m=0.1) for each in (simulator, reference))
+    seen, expected = (each.visible(poses, camera, points, pairs, tolerance_m=0.1) for each in (simulator, reference))
     assert 0.1 < expected.mean() < 0.95
     assert (seen == expected).mean() >= 0.99
     # In any order of the pairs, and with cameras that none of them asks about.
     order = np.random.default_rng(0).permutation(len(pairs))[:500]
-    np.testing.assert_array_equal(simulator.visible(poses, points, pairs[order], tolerance_m=0.1), seen[order])
+    again = simulator.visible(poses, camera, points, pairs[order], tolerance_m=0.1)
+    np.testing.assert_array_equal(again, seen[order])
 
 
 @pytest.mark.parametrize("size", [(160, 120), (161, 121), (37, 20)])

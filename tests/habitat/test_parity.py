@@ -136,7 +136,8 @@ def test_visible_cells_are_those_that_rays_reach(both, measure):
     everything = np.ones((len(poses), len(points)), bool)
     pairs = candidates(poses, settings.intrinsics, points, everything, max_range_m=settings.max_range_m)
     answers = [
-        simulator.visible(poses, points, pairs, tolerance_m=settings.tolerance_m) for simulator in (raycast, habitat)
+        simulator.visible(poses, settings.intrinsics, points, pairs, tolerance_m=settings.tolerance_m)
+        for simulator in (raycast, habitat)
     ]
     assert 0.02 < answers[0].mean() < 0.98
     assert (answers[0] == answers[1]).mean() >= 0.99

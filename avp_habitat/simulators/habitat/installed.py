@@ -13,8 +13,9 @@ from avp_habitat.errors import SimulatorError
 from avp_habitat.versions import version_of
 
 HOW_TO_GET = (
-    "habitat-sim is not installed, and the package index has none; with Python 3.11 or 3.12 in a conda environment: "
-    "conda install habitat-sim headless -c conda-forge -c aihabitat; or use --simulator raycast, which needs nothing"
+    "habitat-sim is not installed, and the package index has none; build version 0.3.4 from its sources "
+    "(github.com/facebookresearch/habitat-sim, BUILD_FROM_SOURCE.md): conda's packages were reported to be for Python "
+    "3.9 only (its issue 2625); or use --simulator raycast, which needs nothing"
 )
 LIBRARY_PACKAGES = {
     "libEGL.so.1": "libegl1",
@@ -30,7 +31,7 @@ _PACKAGE_OF = {"quaternion": "numpy-quaternion", "attr": "attrs", "git": "gitpyt
 # Versions up to 0.3.3 carry pybind11 2.10 and 2.11, which read NumPy 1's structures: with NumPy 2 such a module loads
 # without a word and then hands out wrong arrays (tried with pybind11 2.11.1 and NumPy 2.3.5: element size 0).
 _FIRST_FOR_NUMPY_2 = (0, 3, 4)
-# Supported by the suite: 0.2.4 to 0.3.4. Conda's packages up to 0.3.3 are for Python 3.9, those of 0.3.4 for 3.10-3.12.
+# Supported by the suite: 0.2.4 to 0.3.4. Conda's packages up to 0.3.3 were reported to be for Python 3.9 only.
 _OLDEST = (0, 2, 4)
 
 
@@ -174,8 +175,8 @@ def _wrong_python(built_for: list[str | None]) -> str:
     here, theirs = _this_python(), ", ".join(sorted({str(python) for python in built_for}))
     where = f"{sys.platform}-{sysconfig.get_platform().split('-')[-1]}"
     return (
-        f"it was built for Python {theirs} and this is Python {here} on {where}; install habitat-sim 0.3.4, which has "
-        "packages for Python 3.10 to 3.12 (older ones: for 3.9 only), or build it with this Python"
+        f"it was built for Python {theirs} and this is Python {here} on {where}; build habitat-sim "
+        "0.3.4 from its sources with this Python (BUILD_FROM_SOURCE.md in its repository)"
     )
 
 

@@ -2,6 +2,7 @@
 
 import tempfile
 import weakref
+from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,9 @@ from avp_habitat.simulators.habitat.stage import write_stage
 if TYPE_CHECKING:
     from avp_habitat.simulators.habitat.engine import HabitatEngine
 
-_COVERAGE_CAMERA = Intrinsics.from_hfov(640, 480, hfov_deg=90.0)
+_FOCAL_PX, _MOST_PX = 320.0, 1280
+"""Points are looked for in images of about this focal length, that of 640x480 pixels at 90°, unless that is larger."""
+_CAMERAS_PER_CALL = 64
 
 
 class HabitatSimulator:
@@ -95,17 +98,23 @@ class HabitatSimulator:
     def visible(
         self,
         camera_to_world: NDArray[np.floating],
+        intrinsics: Intrinsics,
         points: NDArray[np.floating],
         pairs: NDArray[np.integer],
         *,
         tolerance_m: float,
     ) -> NDArray[np.bool_]:
-        """Whether camera rays reach points, from depth images; see `simulators.base.Simulator.visible`."""
+        """Whether cameras see points, from depth images; see `simulators.base.Simulator.visible`."""
+        fine, seen = _finer(intrinsics), np.zeros(len(pairs), dtype=np.bool_)
         asked, camera = np.unique(pairs[:, 0], return_inverse=True)
-        poses = np.asarray(camera_to_world)[asked]
-        depth = self.render(poses, _COVERAGE_CAMERA, rgb=False).depth
-        among = np.stack([camera.reshape(-1), pairs[:, 1]], axis=1)
-        return visible_in_depth(poses, _COVERAGE_CAMERA, depth, points, among, tolerance_m=tolerance_m)
+        camera = camera.reshape(-1)
+        for start in range(0, len(asked), _CAMERAS_PER_CALL):
+            poses = np.asarray(camera_to_world)[asked[start : start + _CAMERAS_PER_CALL]]
+            depth = self.render(poses, fine, rgb=False).depth
+            here = np.flatnonzero((camera >= start) & (camera < start + _CAMERAS_PER_CALL))
+            among = np.stack([camera[here] - start, pairs[here, 1]], axis=1)
+            seen[here] = visible_in_depth(poses, fine, depth, points, among, tolerance_m=tolerance_m)
+        return seen
 
     def native_steps(self, positions: NDArray[np.floating], displacements: NDArray[np.floating]) -> NDArray[np.float64]:
         """Where Habitat-Sim's own filter (`PathFinder.try_step`) lets agents arrive, on the NavMesh that it computed.
@@ -134,6 +143,12 @@ class HabitatSimulator:
     def close(self) -> None:
         """Free the simulator and its graphics context; another one can then be opened in this process."""
         self._closing()
+
+
+def _finer(camera: Intrinsics) -> Intrinsics:
+    """The same field of view in more pixels, where a camera has few: coverage must not depend on their number."""
+    times = max(1, min(round(_FOCAL_PX / camera.fx), _MOST_PX // max(camera.width, camera.height)))
+    return Intrinsics(*(times * value for value in astuple(camera)))
 
 
 def _open(location: SceneLocation, frame: Frame, gpu: int) -> "HabitatEngine":

@@ -1,0 +1,69 @@
+"""Settings that say their ranges in their types, and the one function that holds them."""
+
+from dataclasses import dataclass, fields
+from functools import cache
+from numbers import Real
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+from avp_habitat.errors import UsageError, unknown_name
+
+
+@dataclass(frozen=True)
+class Range:
+    """Numbers from `least` to `most`, both allowed: `width: Annotated[int, Range(1, 4096)]`."""
+
+    least: float
+    """Least one."""
+    most: float
+    """Greatest one."""
+
+
+def hold_ranges(settings: Any) -> None:
+    """Hold every number of a dataclass to the range of its type, and every `Literal` to its values.
+
+    Whole numbers of any kind (160.0, numpy's) become `int` and others `float`, so that settings look alike
+    however they were given.
+
+    Args:
+        settings: a dataclass, frozen or not, fresh from its constructor.
+
+    Raises:
+        UsageError: a value is no such number, is NaN or infinite, or lies outside; the text names the field.
+    """
+    for name, hint in _hints(type(settings)).items():
+        value = getattr(settings, name)
+        if get_origin(hint) is Annotated:
+            kind, limits = get_args(hint)
+            object.__setattr__(settings, name, number(name, value, kind, limits))
+        elif get_origin(hint) is Literal and value not in get_args(hint):
+            raise unknown_name(name, str(value), get_args(hint))
+        elif hint is bool and not isinstance(value, bool):
+            raise UsageError(f"{name}: expected True or False, got {value!r}")
+
+
+def number(name: str, value: Any, kind: type, limits: Range) -> Any:
+    """A number as `kind` (`int` or `float`).
+
+    Args:
+        name: of the option, for the error.
+        value: what the user gave.
+        kind: what it becomes.
+        limits: of its range.
+
+    Raises:
+        UsageError: it is no such number.
+    """
+    whole = kind is int
+    # Truth values are whole numbers to Python, and texts none.
+    real = isinstance(value, Real) and not isinstance(value, bool)
+    given: Any = value
+    if not real or not limits.least <= given <= limits.most or (whole and given % 1):
+        expected = f"a {'whole ' if whole else ''}number from {limits.least:,g} to {limits.most:,g}"
+        raise UsageError(f"{name}: expected {expected}, got {value!r}")
+    return kind(given)
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    hints = get_type_hints(kind, include_extras=True)
+    return {field.name: hints[field.name] for field in fields(kind)}

@@ -1,0 +1,198 @@
+"""A policy that Stable-Baselines3 saved: what its file would run, and the statistics of `VecNormalize` beside it."""
+
+import base64
+import io
+import json
+import pickle
+import re
+import zipfile
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from numpy.typing import NDArray
+
+from avp_habitat.errors import PolicyError
+
+_NUMPY = "_reconstruct scalar _frombuffer"
+_KNOWN = {
+    "collections": "deque OrderedDict",
+    "gymnasium.spaces.box": "Box",
+    "gymnasium.spaces.dict": "Dict",
+    "gymnasium.spaces.discrete": "Discrete",
+    "gymnasium.spaces.multi_binary": "MultiBinary",
+    "gymnasium.spaces.multi_discrete": "MultiDiscrete",
+    "numpy": "dtype ndarray bool_ float32 float64 int8 int32 int64 uint8",
+    "numpy.core.multiarray": _NUMPY,
+    "numpy.core.numeric": _NUMPY,
+    "numpy._core.multiarray": _NUMPY,
+    "numpy._core.numeric": _NUMPY,
+    "numpy.random._pcg64": "PCG64",
+    "numpy.random._pickle": "__bit_generator_ctor __generator_ctor",
+    "numpy.random.bit_generator": "SeedSequence __pyx_unpickle_SeedSequence",
+    "rl_zoo3.utils": "SimpleLinearSchedule",
+    "stable_baselines3.common.buffers": "RolloutBuffer DictRolloutBuffer",
+    "stable_baselines3.common.policies": "ActorCriticPolicy ActorCriticCnnPolicy MultiInputActorCriticPolicy",
+    "stable_baselines3.common.running_mean_std": "RunningMeanStd",
+    "stable_baselines3.common.sb2_compat.rmsprop_tf_like": "RMSpropTFLike",
+    "stable_baselines3.common.utils": "ConstantSchedule FloatSchedule LinearSchedule",
+    "stable_baselines3.common.vec_env.vec_normalize": "VecNormalize",
+    "torch.nn.modules.activation": "ELU GELU LeakyReLU Mish ReLU Sigmoid SiLU Softplus Tanh",
+    "torch.optim.adam": "Adam",
+    "torch.optim.adamw": "AdamW",
+    "torch.optim.rmsprop": "RMSprop",
+    "torch.optim.sgd": "SGD",
+}
+"""What PPO's own models and statistics are made of: making these objects does nothing else. All else may run code."""
+_CHECKPOINT = re.compile(r"(?P<name>.+)_(?P<steps>\d+)_steps")
+_DATA = "data"
+# Of the last reset before normalisation; Stable-Baselines3 keeps it only where the environment is normalised.
+_TELLS_NORMALISED = "_last_original_obs"
+
+
+class _KnownObjects(pickle.Unpickler):
+    def __init__(self, file: BinaryIO, path: Path) -> None:
+        super().__init__(file)
+        self._path = path
+
+    def find_class(self, module: str, name: str) -> Any:
+        if name not in _KNOWN.get(module, "").split():
+            raise PolicyError(
+                f"{self._path}: opening it would run code that it holds or names, found {module}.{name}; if you know "
+                "who made it, open it with --trusted"
+            )
+        return super().find_class(module, name)
+
+
+def check_harmless(path: Path) -> None:
+    """Refuse a model (`.zip`) or statistics (`.pkl`) whose pickles could run anything but what such files consist of.
+
+    Nothing that is not known is called, also not to find out.
+
+    Raises:
+        PolicyError: there is something else in it, or it cannot be read.
+    """
+    try:
+        for pickled in _pickles(path):
+            _KnownObjects(pickled, path).load()
+    except PolicyError:
+        raise
+    except ModuleNotFoundError as error:
+        raise PolicyError(f"{path}: needs a package that is not installed: {error.name}") from None
+    except Exception as error:
+        # Whatever a damaged or forged pickle comes to; it must not be opened without this check.
+        raise PolicyError(f"{path}: {_expected(path)}, could not load it: {error}") from None
+
+
+def _pickles(path: Path) -> list[BinaryIO]:
+    if path.suffix != ".zip":
+        return [io.BytesIO(path.read_bytes())]
+    values = [value for value in _data(path).values() if isinstance(value, dict) and ":serialized:" in value]
+    return [io.BytesIO(base64.b64decode(value[":serialized:"])) for value in values]
+
+
+def _expected(path: Path) -> str:
+    if path.suffix == ".zip":
+        return "expected a PPO model of Stable-Baselines3"
+    return "expected the statistics of Stable-Baselines3's VecNormalize"
+
+
+def is_normalised(path: Path) -> bool:
+    """Whether a model (`.zip`) was trained under `VecNormalize`; its pickles are not opened."""
+    try:
+        return _data(path).get(_TELLS_NORMALISED) is not None
+    except (OSError, KeyError, ValueError, AttributeError, zipfile.BadZipFile):
+        return False
+
+
+def _data(path: Path) -> dict[str, Any]:
+    with zipfile.ZipFile(path) as archive:
+        return json.loads(archive.read(_DATA))
+
+
+def statistics_names(path: Path) -> list[Path]:
+    """Where the statistics that belong to a model may lie, the likeliest first.
+
+    Beside `NAME.zip` these are `NAME_vecnormalize.pkl` (ours), for `NAME_10_steps.zip` `NAME_vecnormalize_10_steps.pkl`
+    (CheckpointCallback), `ENV/vecnormalize.pkl` in a folder `ENV_1` (rl_zoo3), and `vec_normalize.pkl` or
+    `vecnormalize.pkl` (SB3's examples, Hugging Face).
+    """
+    folder, found = path.parent, [path.with_name(f"{path.stem}_vecnormalize.pkl")]
+    if steps := _CHECKPOINT.fullmatch(path.stem):
+        found.append(path.with_name(f"{steps['name']}_vecnormalize_{steps['steps']}_steps.pkl"))
+    run = folder.resolve().name
+    found += [
+        folder / run[: match.start()] / "vecnormalize.pkl" for match in reversed(list(re.finditer(r"_\d+(?=_|$)", run)))
+    ]
+    return [*found, folder / "vec_normalize.pkl", folder / "vecnormalize.pkl"]
+
+
+def statistics_of(path: Path) -> Path | None:
+    """The file of the statistics that a model needs; None where it was not trained under `VecNormalize`.
+
+    Raises:
+        PolicyError: it was, and none of them is there.
+    """
+    if not is_normalised(path):
+        return None
+    names = statistics_names(path)
+    for found in names:
+        if found.is_file():
+            return found
+    raise PolicyError(
+        f"{path}: trained under VecNormalize, without whose statistics it acts blindly; expected one of "
+        f"{', '.join(map(str, dict.fromkeys(names)))}"
+    )
+
+
+def load_statistics(path: Path, space: Any, *, trusted: bool = False) -> Any:
+    """The `VecNormalize` of a model, without an environment.
+
+    Args:
+        path: of the statistics' file.
+        space: of the observations.
+        trusted: open it whatever it holds.
+
+    Raises:
+        PolicyError: it holds what may run code, something else, or the statistics of other observations.
+    """
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    if not trusted:
+        check_harmless(path)
+    try:
+        with path.open("rb") as file:
+            found = pickle.load(file)
+    except Exception as error:
+        # A pickle may raise anything.
+        raise PolicyError(f"{path}: {_expected(path)}, could not load it: {error}") from None
+    if not isinstance(found, VecNormalize):
+        raise PolicyError(f"{path}: {_expected(path)}, found {type(found).__name__}")
+    if found.observation_space.shape != space.shape:
+        raise PolicyError(
+            f"{path}: {_expected(path)} for observations of shape {space.shape}, found those for "
+            f"{found.observation_space.shape}"
+        )
+    return found
+
+
+class NormalisedPolicy:
+    """A model that sees observations as in its training under `VecNormalize`."""
+
+    def __init__(self, model: Any, statistics: Path, *, trusted: bool = False) -> None:
+        """Join a model and the file of its statistics.
+
+        Raises:
+            PolicyError: as `load_statistics`.
+        """
+        self._model, self._statistics = model, load_statistics(statistics, model.observation_space, trusted=trusted)
+        self.avp_mlflow_run_id = getattr(model, "avp_mlflow_run_id", None)
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray, Any]:
+        """Actions for observations as the environment gives them."""
+        return self._model.predict(self._statistics.normalize_obs(observation), state, episode_start, deterministic)
+
+    def set_random_seed(self, seed: int) -> None:
+        """Seed the draws of actions."""
+        self._model.set_random_seed(seed)
