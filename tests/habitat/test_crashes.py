@@ -38,7 +38,7 @@ import os, signal, sys
 from pathlib import Path
 import numpy as np
 from avp_habitat.poses import Intrinsics
-from avp_habitat.scenes.location import locate
+from avp_habitat.scenes.location import Frame, locate
 from avp_habitat.simulators.habitat.engine import HabitatEngine
 from avp_habitat.simulators.habitat.stage import write_stage
 
@@ -47,7 +47,7 @@ camera = Intrinsics.from_hfov(16, 12, hfov_deg=90.0)
 
 
 def plain(gpu=-1):
-    engine = HabitatEngine(*write_stage(room, locate(room), folder), gpu=gpu)
+    engine = HabitatEngine(*write_stage(locate(room), Frame(), folder), gpu=gpu)
     print("opened", flush=True)
     return engine
 
