@@ -286,8 +286,9 @@ def test_a_simulator_tells_what_it_shows(room):
 
 
 DIGEST = """
-import hashlib, numpy as np
+import hashlib, tempfile, numpy as np
 from avp_habitat.poses import Intrinsics, camera_to_world
+from avp_habitat.rollout_writer import RolloutWriter
 from avp_habitat.scenes.loader import Scene
 from avp_habitat.scenes.mesh import TexturedMesh
 from avp_habitat.simulators.raycast import RaycastSimulator
@@ -300,8 +301,15 @@ uv, colours = rng.random((3 * n, 2)).astype(np.float32), np.ones((3 * n, 3), np.
 textures = [rng.integers(0, 256, (64, 48, 3), dtype=np.uint8), rng.integers(0, 256, (3, 5, 3), dtype=np.uint8)]
 mesh = TexturedMesh(vertices, triangles, uv, colours, rng.integers(-1, 2, 2 * n).astype(np.int32), textures)
 poses = camera_to_world(rng.uniform(-2, 2, (4, 3)), yaw=rng.uniform(-3, 3, 4), pitch=np.zeros(4))
-frames = RaycastSimulator(Scene("x", "x", mesh)).render(poses, Intrinsics.from_hfov(320, 240, hfov_deg=90), rgb=True)
-print(hashlib.sha256(frames.rgb.tobytes() + frames.depth.tobytes()).hexdigest())
+camera = Intrinsics.from_hfov(320, 240, hfov_deg=90)
+frames = RaycastSimulator(Scene("x", "x", mesh)).render(poses, camera, rgb=True)
+digest = hashlib.sha256(frames.rgb.tobytes() + frames.depth.tobytes())
+with tempfile.TemporaryDirectory() as folder, RolloutWriter(folder + "/r", camera) as writer:
+    for rgb, depth, pose in zip(frames.rgb, frames.depth, poses):
+        writer.add_frame(rgb, depth, pose)
+    for view in writer.views(heldout=False):
+        digest.update(view.image.read_bytes() + view.depth.read_bytes())
+print(digest.hexdigest())
 """
 
 
