@@ -172,8 +172,8 @@ def _cause_in_frames(
     proved: NDArray[np.bool_],
 ) -> str:
     pictures = sorted(off)
-    what = "pictures" if proved[pictures].all() else "poses"
-    known = ": the depth proves their poses right" if what == "pictures" else ""
+    what, other = ("pictures", "poses") if proved[pictures].all() else ("poses", "pictures")
+    known = ": the depth proves the poses right" if what == "pictures" else ""
     for first, second in combinations(pictures, 2):
         exchanged = poses.copy()
         exchanged[[first, second]] = poses[[second, first]]
@@ -181,10 +181,10 @@ def _cause_in_frames(
         if all(shares[picture] - off[picture].given > off[picture].gain / 2 for picture in (first, second)):
             return f"the {what} of frames {frames[first]} and {frames[second]} look exchanged{known}"
     names = ", ".join(str(frame) for frame in frames[pictures])
-    if known:
-        return f"the pictures of frames {names} are not those of their places{known}"
     if len(pictures) > 1:
-        return f"the poses of frames {names} do not fit their pictures, those of the others do"
+        return f"the {what} of frames {names} do not fit their {other}, those of the others do{known}"
+    if known:
+        return f"the picture of frame {names} does not fit its pose{known}"
     shift_m, turn_deg = shift_and_turn(off[pictures[0]], poses[pictures[0]])
     return (
         f"the pose of frame {names} looks {100 * shift_m:.1f} cm and {turn_deg:.1f} degrees off, "

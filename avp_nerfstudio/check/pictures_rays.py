@@ -88,9 +88,9 @@ def ray_errors(stacked: Stacked, poses: Float, intrinsics: Intrinsics) -> Float:
 
 def pair_medians(stacked: Stacked, errors: Float) -> Float:
     """`(p,)` median of the `(m,)` errors of each pair's matches."""
-    return np.array(
-        [np.median(errors[start:end]) for start, end in zip(stacked.start[:-1], stacked.start[1:], strict=True)]
-    )
+    ranked = errors[np.lexsort((errors, stacked.pair))]
+    count = np.diff(stacked.start)
+    return (ranked[stacked.start[:-1] + (count - 1) // 2] + ranked[stacked.start[:-1] + count // 2]) / 2
 
 
 def _angle(a: Float, b: Float) -> Float:

@@ -1,0 +1,96 @@
+"""How much has to speak against a pose before the pictures name it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from picture_walk import CAMERA, walk_poses, write_walk
+from wall_walk import TURNING, WALKING, write_wall
+
+from avp_habitat.rollout import read_rollout
+from avp_nerfstudio.check.__main__ import Request, check
+from avp_nerfstudio.check.pictures import check_pictures, judge
+from avp_nerfstudio.check.pictures_frames import gain_limit
+from avp_nerfstudio.check.pictures_matching import match_pictures
+
+POSES = walk_poses()
+ALL = np.ones(len(POSES), bool)
+
+
+@pytest.fixture(scope="module")
+def matches(tmp_path_factory):
+    return match_pictures(write_walk(tmp_path_factory.mktemp("evidence") / "walk"), progress=False)
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory):
+    return write_wall(tmp_path_factory.mktemp("evidence") / "wall", WALKING)
+
+
+@pytest.mark.parametrize(
+    ("poses", "tile_m", "tiled"),
+    [(TURNING, 0.4, 0.3), (TURNING, 0.25, 0.6), (WALKING, 0.25, 0.6)],
+    ids=["turning", "turning before small tiles", "walking along small tiles"],
+)
+def test_correct_poses_before_a_wall_that_repeats_itself_pass(tmp_path, poses, tile_m, tiled):
+    rollout = write_wall(tmp_path / "wall", poses, tile_m=tile_m, tiled=tiled)
+    verdicts = check_pictures(rollout, progress=False)
+    assert [verdict.passed for verdict in verdicts] == [True, True], [verdict.text for verdict in verdicts]
+    assert verdicts[0].figures["frames_off"] == 0
+
+
+def test_all_checks_of_such_a_rollout_pass(wall, tmp_path):
+    verdicts = check(Request(wall.folder, tmp_path / "out"))
+    assert [verdict.name for verdict in verdicts if not verdict.passed] == []
+    assert verdicts[-1].figures["rotation_median_deg"] > 0.5
+
+
+def test_a_wrong_pose_before_such_a_wall_is_named_all_the_same(wall):
+    wrong = [replace(view, camera_to_world=view.camera_to_world.copy()) for view in wall.frames]
+    wrong[7].camera_to_world[:3, 3] += [0.05, 0.05, 0.0]
+    reprojection, _ = check_pictures(replace(wall, frames=wrong), progress=False)
+    assert not reprojection.passed
+    assert "the pose of frame 7 looks" in str(reprojection.cause)
+
+
+def test_little_evidence_and_many_frames_allow_more_by_chance():
+    assert gain_limit(2, 80) > gain_limit(4, 80) > gain_limit(16, 80) > 0.1
+    assert gain_limit(4, 1000) > gain_limit(4, 80) > gain_limit(4, 1)
+    assert gain_limit(10_000, 80) == pytest.approx(0.1, abs=0.01)
+
+
+def moved(frame, up_m):
+    poses = POSES.copy()
+    poses[frame, 1, 3] += up_m
+    return poses
+
+
+def test_no_pose_is_named_that_the_depth_proves_right(matches):
+    proved = ALL.copy()
+    assert "pose of frame 6 looks" in str(judge(matches, moved(6, 0.015), CAMERA)[0].cause)
+    assert judge(matches, moved(6, 0.015), CAMERA, proved=proved)[0].passed
+    much = judge(matches, moved(6, 0.05), CAMERA, proved=proved)[0]
+    assert much.cause == "the picture of frame 6 does not fit its pose: the depth proves the poses right"
+    proved[6] = False
+    assert "pose of frame 6 looks" in str(judge(matches, moved(6, 0.015), CAMERA, proved=proved)[0].cause)
+
+
+def test_pictures_that_were_exchanged_are_named_when_the_depth_proves_the_poses(matches):
+    exchanged = POSES.copy()
+    exchanged[[4, 9]] = POSES[[9, 4]]
+    reprojection, _ = judge(matches, exchanged, CAMERA, proved=ALL)
+    assert reprojection.cause == "the pictures of frames 4 and 9 look exchanged: the depth proves the poses right"
+
+
+def test_exchanged_picture_files_are_named_by_the_whole_check(tmp_path):
+    folder = write_walk(tmp_path / "walk").folder
+    first, second, aside = (folder / "images" / name for name in ("frame_00004.png", "frame_00009.png", "aside"))
+    first.rename(aside)
+    second.rename(first)
+    aside.rename(second)
+    verdicts = {verdict.name: verdict for verdict in check(Request(folder, tmp_path / "out"))}
+    assert all(verdicts[name].passed for name in ("format", "depth agreement", "ICP correction"))
+    assert not verdicts["reprojection"].passed
+    causes = {verdict.cause for verdict in verdicts.values() if not verdict.passed}
+    assert causes == {"the pictures of frames 4 and 9 look exchanged: the depth proves the poses right"}
+    assert len(read_rollout(folder).frames) == len(POSES)
