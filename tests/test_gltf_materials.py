@@ -13,7 +13,7 @@ from avp_habitat.errors import SceneError
 from avp_habitat.poses import Intrinsics, camera_to_world
 from avp_habitat.scenes.export import export_glb
 from avp_habitat.scenes.loader import load_scene
-from avp_habitat.scenes.location import locate
+from avp_habitat.scenes.location import Frame, locate
 from avp_habitat.scenes.mesh import TexturedMesh
 from avp_habitat.simulators.habitat.stage import write_stage
 from avp_habitat.simulators.raycast import RaycastSimulator
@@ -353,7 +353,7 @@ def glowing() -> Gltf:
 def test_habitat_is_given_what_it_would_not_show_rightly_in_a_form_that_it_does(tmp_path, document, rewritten):
     path = document.write(tmp_path)
     (tmp_path / "stage").mkdir()
-    write_stage(path, locate(path), tmp_path / "stage")
+    write_stage(locate(path), Frame(), tmp_path / "stage")
     asset = Path(json.loads((tmp_path / "stage/scene.stage_config.json").read_text())["render_asset"])
     assert asset == (tmp_path / "stage/room.glb" if rewritten else Path(path))
     assert len(load_scene(str(asset)).mesh.triangles) == len(load_scene(path).mesh.triangles)
@@ -361,5 +361,5 @@ def test_habitat_is_given_what_it_would_not_show_rightly_in_a_form_that_it_does(
 
 def test_habitat_is_given_a_file_that_only_it_reads(tmp_path):
     path = quad(extensionsRequired=["KHR_texture_basisu"], materials=[{"alphaMode": "MASK"}]).write(tmp_path)
-    write_stage(path, locate(path), tmp_path)
+    write_stage(locate(path), Frame(), tmp_path)
     assert json.loads((tmp_path / "scene.stage_config.json").read_text())["render_asset"] == path
