@@ -117,7 +117,7 @@ def test_without_a_policys_run_mlflows_variable_names_the_experiment(rollout, st
 
 def test_a_deleted_experiment_is_named_before_a_run_is_made(rollout, store):
     store.delete_experiment(store.create_experiment("gone"))
-    with pytest.raises(TrackingError, match="MLflow experiment 'gone' at .* is deleted; .*mlflow experiments restore"):
+    with pytest.raises(TrackingError, match=r"MLflow experiment 'gone' at .* is deleted; .*mlflow experiments restore"):
         rollout_run(store, rollout, experiment="gone")
 
 
