@@ -60,8 +60,8 @@ def facts_of(config: Any) -> Facts:
     if policy_runs:
         tags[rollout_facts.POLICY_RUN_TAG] = joined(policy_runs)
     title = rollout_facts.title(metas[0])
-    if title is not None and len(folders) == 1 and config.experiment_name == folders[0].stem:
-        # nerfstudio's own name, that of the folder, which may be any.
+    if title is not None and len(folders) == 1 and config.experiment_name in (folders[0].stem, "unnamed"):
+        # nerfstudio's own names: that of the folder, or none where the data is given to the dataparser.
         name = f"{config.method_name} {title}"
     # The figures of a rollout are those of all its frames and of no others.
     prefix = "eval" if _is_whole(config) else "rollout"

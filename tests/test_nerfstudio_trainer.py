@@ -255,9 +255,14 @@ def test_figures_of_rollouts_are_not_taken_for_those_of_a_part_or_of_several(tmp
     parser = config.pipeline.datamanager.dataparser
     parser.data = room
     for folder, policy_run in ((room, "1" * 32), (other, "2" * 32)):
-        tell_origin(folder, metrics={"coverage": 0.5}, mlflow_run_id=policy_run)
+        origin = {"scene": {"name": "a.glb"}, "policy": {"name": "oracle"}, "seed": 3}
+        tell_origin(folder, metrics={"coverage": 0.5}, mlflow_run_id=policy_run, **origin)
     assert facts_of(config).metrics == {"eval/coverage": 0.5}
     assert facts_of(config).policy_runs == ("1" * 32,)
+    config.experiment_name = None
+    assert facts_of(config).name == "avp-nerfacto oracle a.glb seed 3"
+    config.experiment_name = "mine"
+    assert facts_of(config).name == "avp-nerfacto mine"
     parser.max_views = 3
     assert facts_of(config).metrics == {"rollout/coverage": 0.5}
     parser.max_views, parser.also = 0, (other,)
