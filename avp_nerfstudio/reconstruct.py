@@ -105,6 +105,7 @@ def _check_rollout(request: Request, rollout: Rollout) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m avp_nerfstudio.reconstruct",
+        epilog=explained("PSNR", "SSIM", "LPIPS"),
         description="Train on the captured frames of a rollout, score its held-out views, and write the scores to a "
         "folder that exists only when all is done.",
     )
@@ -153,7 +154,6 @@ def main(argv: Sequence[str]) -> None:
     words = ", ".join(f"{name} {value:.4g}" for name, value in found["scores"].items() if value is not None)
     missing = "" if found["lpips_reason"] is None else ", no lpips (scores.json says why)"
     print(f"{request.out}: {words}{missing}")
-    print(explained("PSNR", "SSIM", "LPIPS"))
 
 
 if __name__ == "__main__":
