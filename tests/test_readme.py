@@ -120,9 +120,21 @@ FORMS = {
         {"--data runs/r0": f"--data runs/r0 {CPU}"},
         needs=(COLLECT,),
     ),
+    # Where there is no GPU it says at once what to type instead: the line after it on the page.
     "ns-train nerfacto avp-data --data runs/r0": Form(
+        r"none was found here.*--machine.device-type cpu|Trainer.*finished|Training Finished",
+        {"avp-data": "--max-num-iterations 3 --vis tensorboard avp-data"},
+        codes=(0, 1),
+        needs=(COLLECT,),
+        weights=True,
+    ),
+    "ns-train nerfacto --machine.device-type cpu --pipeline.model.implementation torch --mixed-precision False"
+    " avp-data --data runs/r0": Form(
         r"nerfacto",
-        {"avp-data": f"{CPU} --mixed-precision False avp-data"},
+        {
+            "--mixed-precision False": "--mixed-precision False --max-num-iterations 3 --timestamp t --vis tensorboard "
+            "--pipeline.model.log2-hashmap-size 10 --pipeline.datamanager.train-num-rays-per-batch 128"
+        },
         needs=(COLLECT,),
         slow=True,
         weights=True,
