@@ -7,16 +7,17 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles, decode_picture
-from avp_habitat.scenes.mesh import TexturedMesh, fan_corners
+from avp_habitat.scenes.mesh import TexturedMesh
 from avp_habitat.scenes.mtl import Material, MaterialLibrary
 from avp_habitat.scenes.notices import say_once
+from avp_habitat.scenes.polygons import triangulate
 
 _MOST = 2**31 - 1
 """What an index of 32 bits can hold."""
 
 
 def read_obj(files: SceneFiles) -> TexturedMesh:
-    """The polygons of an `.obj` file as fans of triangles, float64 positions in the file's axes.
+    """The polygons of an `.obj` file as triangles, float64 positions in the file's axes.
 
     Colours are texture × `Kd` × vertex colour (`v x y z r g b`).
 
@@ -83,13 +84,17 @@ class _Reader:
         Raises:
             SceneError: there are none, one names a vertex that is not there, or a picture cannot be read.
         """
-        places, polygons = fan_corners(np.array(self._lengths, np.int64))
+        corners = np.array(self._corners, np.int64).reshape(-1, 2)
+        for column, (kind, count) in enumerate((("v", len(self._positions)), ("vt", len(self._coordinates)))):
+            if corners[:, column].max(initial=-1) >= count:
+                raise SceneError(f"{self._files.path}: a face names {kind} {corners[:, column].max() + 1} of {count}")
+        positions = np.array(self._positions, np.float64).reshape(-1, 3)
+        try:
+            places, polygons = triangulate(np.array(self._lengths, np.int64), corners[:, 0], positions)
+        except ValueError as error:
+            raise SceneError(f"{self._files.path}: {error}") from None
         if not len(places):
             raise SceneError(f"{self._files.path}: expected a mesh with triangles, found none")
-        corners = np.array(self._corners, np.int64)
-        for column, (kind, count) in enumerate((("v", len(self._positions)), ("vt", len(self._coordinates)))):
-            if corners[:, column].max() >= count:
-                raise SceneError(f"{self._files.path}: a face names {kind} {corners[:, column].max() + 1} of {count}")
         material = np.array(self._materials, np.int64)[polygons]
         # One vertex for each combination of position, texture coordinate and material.
         parts = np.stack([*corners[places].reshape(-1, 2).T, np.repeat(material, 3)])
@@ -100,7 +105,7 @@ class _Reader:
         slots, textures = self._textures(materials)
         textured = (corners[places][..., 1] >= 0).all(axis=1)
         return TexturedMesh(
-            np.array(self._positions, np.float64)[position],
+            positions[position],
             triangles.reshape(-1, 3).astype(np.int32),
             self._uv(coordinate - 1, of_vertex, materials),
             self._colours(position, of_vertex, materials),
