@@ -1,6 +1,7 @@
 """Reads Wavefront OBJ files into one TexturedMesh."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ def read_lines(name: str, content: bytes, take: Callable[[str, str], None]) -> N
         SceneError: `take` raised a ValueError; the text names the line.
     """
     before = ""
-    for number, raw in enumerate(content.decode("utf-8", "surrogateescape").split("\n"), start=1):
+    for number, raw in enumerate(content.decode("utf-8-sig", "surrogateescape").split("\n"), start=1):
         line = f"{before} {raw}".strip() if before else raw.strip()
         before = line[:-1] if line.endswith("\\") else ""
         if before or not line or line.startswith("#"):
@@ -114,19 +115,19 @@ class _Reader:
         )
 
     def _vertex(self, rest: str) -> None:
-        numbers = [float(word) for word in rest.split()]
+        numbers = [float(word) for word in _data(rest)]
         if len(numbers) < 3:
             raise ValueError(f"expected three coordinates for every vertex, got {len(numbers)}")
         self._positions.append(numbers[:3])
         self._light.append(numbers[3:6] if len(numbers) >= 6 else [1.0, 1.0, 1.0])
 
     def _coordinate(self, rest: str) -> None:
-        numbers = [float(word) for word in rest.split()[:2]]
+        numbers = [float(word) for word in _data(rest)[:2]]
         self._coordinates.append((numbers + [0.0, 0.0])[:2])
 
     def _face(self, rest: str) -> None:
         """Corners `v`, `v/vt`, `v//vn` or `v/vt/vn`."""
-        words = rest.split()
+        words = _data(rest)
         for word in words:
             vertex, _, more = word.partition("/")
             coordinate = more.partition("/")[0]
@@ -157,6 +158,9 @@ class _Reader:
         if material is None:
             say_once(path, f"its material {name!r} is in none of its libraries and is shown white")
             return Material()
+        if material.picture and not any(material.diffuse):
+            say_once(path, f"its material {name!r} has a picture and a black Kd, which is taken for white")
+            material = replace(material, diffuse=[1.0, 1.0, 1.0])
         if material.lost:
             say_once(path, f"of its material {name!r}, {', '.join(material.lost)} is not followed")
         return material
@@ -182,6 +186,11 @@ class _Reader:
         light /= 255 if light.max() > 2 else 1
         diffuse = np.array([each.diffuse for each in materials], np.float64)
         return np.clip(light[position] * diffuse[of_vertex], 0, 1).astype(np.float32)
+
+
+def _data(rest: str) -> list[str]:
+    """The words of a line of numbers, a comment behind them apart."""
+    return rest.partition("#")[0].split()
 
 
 def _index(text: str, count: int) -> int:

@@ -93,13 +93,38 @@ def _tables(content: bytes) -> tuple[dict[str, _Columns], list[str]]:
         raise ValueError("truncated: expected a header that ends with end_header")
     lines = content[: end.start()].decode("utf-8", "replace").splitlines()
     order, elements, pictures = _header([line.split() for line in lines[1:] if line.strip()], lines)
-    body = content[end.end() :]
+    body = text = content[end.end() :]
     if order == "=":
-        body = _numbers(body)
+        body = _numbers(text)
     at, tables = 0, {}
     for element in elements:
         tables[element.name], at = _read(element, body, at)
+    if order == "=":
+        _check_lines(elements, tables, text)
     return tables, pictures
+
+
+def _check_lines(elements: list[_Element], tables: dict[str, _Columns], text: bytes) -> None:
+    """Refuse a text in which a row lacks a number, or has one too many, that others then stood for.
+
+    Raises:
+        ValueError: there are as many lines as rows, and one holds not what its row needs.
+    """
+    rows = [np.zeros(0, np.int64)]
+    for each in elements:
+        if columns := tables[each.name]:
+            rows.append(
+                np.sum([columns[one.name].lengths + (one.count is not None) for one in each.properties], axis=0)
+            )
+    expected = np.concatenate(rows)
+    characters = np.frombuffer(text, np.uint8)
+    begin = np.flatnonzero((characters > 32) & (np.append(32, characters[:-1]) <= 32))
+    line = np.searchsorted(np.flatnonzero((characters == 10) | (characters == 13)), begin)
+    found = np.diff(np.flatnonzero(np.diff(line, prepend=-1, append=-1)))
+    # Lines may be broken anywhere by who does not care for them.
+    if len(found) == len(expected) and (found != expected).any():
+        row = np.flatnonzero(found != expected)[0]
+        raise ValueError(f"line {row + 1} after the header has {found[row]} numbers; expected {expected[row]}")
 
 
 def _header(words: list[list[str]], lines: list[str]) -> tuple[str, list[_Element], list[str]]:
