@@ -174,14 +174,21 @@ def reward_parts(name: str, facts: StepFacts, constants: RewardConstants) -> dic
         constants: of all rewards.
 
     Raises:
-        UsageError: no such reward, or a part is neither one number for each agent nor one for all of them.
+        UsageError: no such reward, or a part is neither one finite number for each agent nor one for all of them.
     """
     parts = REWARDS[check_reward(name)](facts, constants)
+    if not isinstance(parts, Mapping):
+        raise UsageError(f"reward {name}: expected parts by name, as {{'new': …}}, got {type(parts).__name__}")
     return {part: _for_each(len(facts.coverage), value, f"{name}: part {part!r}") for part, value in parts.items()}
 
 
 def _for_each(agents: int, value: Number | float, what: str) -> NDArray[np.float64]:
-    numbers = np.asarray(value, dtype=np.float64)
+    try:
+        numbers = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise UsageError(f"reward {what}: expected numbers, got {value!r}") from None
+    if not np.isfinite(numbers).all():
+        raise UsageError(f"reward {what}: expected finite numbers, got {value!r}")
     if numbers.shape not in ((), (agents,)):
         raise UsageError(f"reward {what}: expected one number for each of {agents} agents, got shape {numbers.shape}")
     return np.full(agents, numbers) if numbers.ndim == 0 else numbers

@@ -6,9 +6,11 @@ import json
 import pickle
 import re
 import zipfile
+from collections.abc import Collection
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Self
 
+import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.errors import PolicyError
@@ -29,65 +31,130 @@ _KNOWN = {
     "numpy.random._pcg64": "PCG64",
     "numpy.random._pickle": "__bit_generator_ctor __generator_ctor",
     "numpy.random.bit_generator": "SeedSequence __pyx_unpickle_SeedSequence",
+    "pathlib": "Path PosixPath PurePosixPath WindowsPath",
+    "pathlib._local": "Path PosixPath PurePosixPath WindowsPath",
     "rl_zoo3.utils": "SimpleLinearSchedule",
     "stable_baselines3.common.buffers": "RolloutBuffer DictRolloutBuffer",
     "stable_baselines3.common.policies": "ActorCriticPolicy ActorCriticCnnPolicy MultiInputActorCriticPolicy",
     "stable_baselines3.common.running_mean_std": "RunningMeanStd",
+    "stable_baselines3.common.torch_layers": "CombinedExtractor FlattenExtractor NatureCNN",
     "stable_baselines3.common.sb2_compat.rmsprop_tf_like": "RMSpropTFLike",
     "stable_baselines3.common.utils": "ConstantSchedule FloatSchedule LinearSchedule",
     "stable_baselines3.common.vec_env.vec_normalize": "VecNormalize",
-    "torch.nn.modules.activation": "ELU GELU LeakyReLU Mish ReLU Sigmoid SiLU Softplus Tanh",
+    "torch.nn.modules.activation": "CELU ELU GELU Hardsigmoid Hardswish Hardtanh LeakyReLU LogSigmoid Mish PReLU RReLU "
+    "ReLU ReLU6 SELU Sigmoid SiLU Softplus Softsign Tanh Tanhshrink",
+    "torch.nn.modules.linear": "Identity",
+    "torch.optim.adadelta": "Adadelta",
+    "torch.optim.adagrad": "Adagrad",
     "torch.optim.adam": "Adam",
+    "torch.optim.adamax": "Adamax",
     "torch.optim.adamw": "AdamW",
+    "torch.optim.asgd": "ASGD",
+    "torch.optim.nadam": "NAdam",
+    "torch.optim.radam": "RAdam",
     "torch.optim.rmsprop": "RMSprop",
     "torch.optim.sgd": "SGD",
 }
 """What PPO's own models and statistics are made of: making these objects does nothing else. All else may run code."""
+SCHEDULES = {"learning_rate": 0.0, "lr_schedule": None, "clip_range": 0.2, "clip_range_vf": None}
+"""Of a model, what only its training reads, and what stands for it where a model only acts: often functions, which
+Stable-Baselines3 keeps as code."""
+_OTHERS = tuple(f"stable_baselines3.{each}." for each in ("ddpg", "dqn", "sac", "td3"))
+"""Modules of algorithms that are not like PPO."""
+_PLAIN_TYPE = re.compile(r"[biufcSUO]\d+")
+_PICKLED = ":serialized:"
 _CHECKPOINT = re.compile(r"(?P<name>.+)_(?P<steps>\d+)_steps")
 _DATA = "data"
 # Of the last reset before normalisation; Stable-Baselines3 keeps it only where the environment is normalised.
 _TELLS_NORMALISED = "_last_original_obs"
+# Off-policy algorithms, which have none, keep it always.
+_ON_POLICY = "gae_lambda"
+
+
+class _Nothing:
+    """Stands for an object of a pickle: whatever is done to it does nothing."""
+
+    def __new__(cls, *_: Any, **__: Any) -> Self:
+        return super().__new__(cls)
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        pass
+
+    def __call__(self, *_: Any) -> Self:
+        return self
+
+    def __setstate__(self, state: Any) -> None:
+        pass
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        pass
+
+    def append(self, value: Any) -> None:
+        pass
+
+    def extend(self, values: Any) -> None:
+        pass
+
+
+class _NumpyType(_Nothing):
+    """Stands for a `numpy.dtype`: one that lies about its numbers lets NumPy follow forged addresses."""
+
+    def __init__(self, code: Any, *_: Any) -> None:
+        if not (isinstance(code, str) and _PLAIN_TYPE.fullmatch(code)):
+            raise ValueError(f"expected a plain type of numbers, got {code!r}")
+        self._code = code
+
+    def __setstate__(self, state: Any) -> None:
+        if state != np.dtype(self._code).newbyteorder(state[1]).__reduce__()[2]:
+            raise ValueError(f"expected what NumPy says of {self._code}, got {state!r}")
 
 
 class _KnownObjects(pickle.Unpickler):
+    """Reads a pickle of which nothing is made; only the names in it are looked at."""
+
     def __init__(self, file: BinaryIO, path: Path) -> None:
         super().__init__(file)
         self._path = path
 
     def find_class(self, module: str, name: str) -> Any:
-        if name not in _KNOWN.get(module, "").split():
-            raise PolicyError(
-                f"{self._path}: opening it would run code that it holds or names, found {module}.{name}; if you know "
-                "who made it, open it with --trusted"
-            )
-        return super().find_class(module, name)
+        if name in _KNOWN.get(module, "").split():
+            return type(name, (_NumpyType if (module, name) == ("numpy", "dtype") else _Nothing,), {})
+        if module.startswith(_OTHERS):
+            raise PolicyError(f"{self._path}: {_expected(self._path)}, found one with {module}.{name}")
+        raise PolicyError(
+            f"{self._path}: opening it would run code that it holds or names, found {module}.{name}; if you know "
+            "who made it, open it with --trusted"
+        )
 
 
-def check_harmless(path: Path) -> None:
+def check_harmless(path: Path, *, without: Collection[str] = ()) -> None:
     """Refuse a model (`.zip`) or statistics (`.pkl`) whose pickles could run anything but what such files consist of.
 
-    Nothing that is not known is called, also not to find out.
+    Nothing is called and nothing made, also not to find out.
+
+    Args:
+        path: of the file.
+        without: of a model, the attributes that are not opened.
 
     Raises:
         PolicyError: there is something else in it, or it cannot be read.
     """
     try:
-        for pickled in _pickles(path):
+        for pickled in _pickles(path, without):
             _KnownObjects(pickled, path).load()
     except PolicyError:
         raise
-    except ModuleNotFoundError as error:
-        raise PolicyError(f"{path}: needs a package that is not installed: {error.name}") from None
     except Exception as error:
         # Whatever a damaged or forged pickle comes to; it must not be opened without this check.
         raise PolicyError(f"{path}: {_expected(path)}, could not load it: {error}") from None
 
 
-def _pickles(path: Path) -> list[BinaryIO]:
+def _pickles(path: Path, without: Collection[str]) -> list[BinaryIO]:
     if path.suffix != ".zip":
         return [io.BytesIO(path.read_bytes())]
-    values = [value for value in _data(path).values() if isinstance(value, dict) and ":serialized:" in value]
-    return [io.BytesIO(base64.b64decode(value[":serialized:"])) for value in values]
+    values = [value for key, value in _data(path).items() if key not in without]
+    pickled = [value[_PICKLED] for value in values if isinstance(value, dict) and _PICKLED in value]
+    return [io.BytesIO(base64.b64decode(each)) for each in pickled]
 
 
 def _expected(path: Path) -> str:
@@ -99,8 +166,9 @@ def _expected(path: Path) -> str:
 def is_normalised(path: Path) -> bool:
     """Whether a model (`.zip`) was trained under `VecNormalize`; its pickles are not opened."""
     try:
-        return _data(path).get(_TELLS_NORMALISED) is not None
-    except (OSError, KeyError, ValueError, AttributeError, zipfile.BadZipFile):
+        data = _data(path)
+        return _ON_POLICY in data and data.get(_TELLS_NORMALISED) is not None
+    except (OSError, KeyError, TypeError, ValueError, AttributeError, zipfile.BadZipFile):
         return False
 
 

@@ -22,7 +22,7 @@ class TaskSettings:
     """Name of the reward: coverage, coverage_redundancy, proposed or surface."""
     constants: RewardConstants = field(default_factory=RewardConstants)
     """The rewards' constants."""
-    budget: Annotated[int, Range(1, 100000)] = 80
+    budget: Annotated[int, Range(1, 32767)] = 80
     """T: steps, which are views, per episode."""
     forward_m: Annotated[float, Range(0.01, 10)] = 0.25
     """Length of a forward move in metres."""

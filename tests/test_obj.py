@@ -107,6 +107,8 @@ def test_one_picture_with_two_scales_is_kept_once(tmp_path):
     [
         ("newmtl a\nKd 1 1 1\nmap_Ke glow.png\n", "of its material 'a', map_Ke is not followed"),
         ("newmtl a\nmap_Kd -clamp on map.png\n", "of its material 'a', -clamp on is not followed"),
+        ("newmtl a\nd 0.2\nKe 0 0 0\n", "of its material 'a', d 0.2 is not followed"),
+        ("newmtl a\nKe 1 0.5 0\nd 1\n", "of its material 'a', Ke 1 0.5 0 is not followed"),
         ("newmtl a\nKd spectral file.rfl 1\n", "of its material 'a', Kd spectral is not followed"),
         ("newmtl b\n", "its material 'a' is in none of its libraries and is shown white"),
     ],
@@ -161,3 +163,16 @@ def test_a_damaged_library_is_named(tmp_path, line):
     path = write(tmp_path, "mtllib room.mtl\nusemtl a\n", f"newmtl a\n{line}\n")
     with pytest.raises(SceneError, match=rf"room.obj: room.mtl: .*\(line 2: '{line}'\)"):
         load_scene(path)
+
+
+def test_a_byte_order_mark_hides_no_vertex(tmp_path):
+    text = "\ufeff" + vertices(CORNERS) + "f 1 2 3 4 # floor\nf 5 6 7 8"
+    assert surface(load_scene(write(tmp_path, text)).mesh)[0] == CORNERS[[0, 1, 2]].tolist()
+
+
+def test_a_black_factor_leaves_a_picture_as_it_is(tmp_path, caplog):
+    Image.new("RGB", (2, 2)).save(tmp_path / "map.png")
+    text = "mtllib room.mtl\nusemtl a\nvt 0 0\n" + vertices(CORNERS) + "f 1/1 2/1 3/1\n"
+    mesh = load_scene(write(tmp_path, text, "newmtl a\nKd 0 0 0\nmap_Kd map.png\n")).mesh
+    assert (mesh.colours == 1).all()
+    assert "its material 'a' has a picture and a black Kd, which is taken for white" in caplog.text

@@ -1,5 +1,7 @@
 """PLY files as editors and scanners write them."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -164,3 +166,24 @@ def test_a_text_with_other_things_than_numbers_is_refused(tmp_path):
     path.write_bytes(path.read_bytes().replace(b"\n2 1 0", b"\n2 one 0"))
     with pytest.raises(SceneError, match="expected numbers after the header"):
         load_scene(path)
+
+
+@pytest.mark.parametrize(("line", "row"), [(3, "2 1"), (3, "2 1 0 0"), (8, "4 0 1 2 3 4")])
+def test_a_text_whose_rows_are_not_its_lines_is_refused(tmp_path, line, row):
+    """One number less in a vertex is one corner less in a face, and nothing is left over at the end."""
+    path = tmp_path / "a.ply"
+    lines = Path(ply(path, XYZ, POSITIONS.tolist(), order="\n")).read_text().splitlines()
+    first = lines.index("end_header")
+    lines[first + line] = row
+    path.write_text("\n".join(lines))
+    with pytest.raises(
+        SceneError, match=rf"a\.ply: .*(line {line} after the header has {len(row.split())} numbers|trunc)"
+    ):
+        load_scene(path)
+
+
+def test_a_text_in_lines_of_any_length_is_read(tmp_path):
+    path = tmp_path / "a.ply"
+    head, body = Path(ply(path, XYZ, POSITIONS.tolist(), order="\n")).read_text().split("end_header")
+    path.write_text(f"{head}end_header\n{' '.join(body.split())}\n")
+    assert load_scene(path).mesh.triangles.tolist() == TRIANGLES

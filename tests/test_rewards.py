@@ -198,3 +198,20 @@ def test_a_part_that_is_no_number_for_each_agent_is_named(monkeypatch):
     monkeypatch.setitem(REWARDS, "own", lambda facts, constants: {"pair": np.zeros((6, 2))})
     with pytest.raises(UsageError, match=r"own: part 'pair': expected one number for each of 6 agents, got .*\(6, 2\)"):
         reward_parts("own", random_facts(0), CONSTANTS)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"time": None}, "part 'time': expected finite numbers, got None"),
+        ({"time": np.array([0, np.nan, 0, 0, 0, 0])}, "part 'time': expected finite numbers"),
+        ({"time": np.inf}, "part 'time': expected finite numbers, got inf"),
+        ({"time": "much"}, "part 'time': expected numbers, got 'much'"),
+        ({"time": [[1], [1, 2]]}, "part 'time': expected numbers, got"),
+        (np.ones(6), "expected parts by name, .*, got ndarray"),
+    ],
+)
+def test_what_cannot_be_added_up_is_named(monkeypatch, parts, message):
+    monkeypatch.setitem(REWARDS, "own", lambda facts, constants: parts)
+    with pytest.raises(UsageError, match=rf"reward own: {message}"):
+        reward_parts("own", random_facts(0), CONSTANTS)

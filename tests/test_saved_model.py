@@ -1,22 +1,25 @@
 import os
 import pickle
 import shutil
+import struct
 import zipfile
+from collections import deque
 
 import numpy as np
 import pytest
 from corridor import Corridor
 from mlflow import MlflowClient
-from stable_baselines3 import PPO
+from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import CheckpointCallback
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from torch import nn
+from torch import nn, optim
 from tracking import SETTINGS, SmallEnv, mlflow_home, ppo
 
 from avp_habitat import collect, command
 from avp_habitat.errors import PolicyError
-from avp_habitat.policies import described, make_policy
+from avp_habitat.policies import described, load_model, make_policy
 from avp_habitat.policy_env import make_policy_env
 from avp_habitat.saved_model import check_harmless, statistics_of
 from avp_sb3 import EvaluationCallback, MLflowCallback
@@ -210,6 +213,14 @@ def test_a_damaged_model_is_named(tmp_path, damage):
         {},
         {"learning_rate": LinearSchedule(5e-4, 0.0, 1.0), "clip_range_vf": 0.2},
         {"policy_kwargs": {"net_arch": [8], "activation_fn": nn.ReLU}},
+        {
+            "policy_kwargs": {
+                "activation_fn": nn.SELU,
+                "optimizer_class": optim.NAdam,
+                "net_arch": {"pi": [8], "vf": [8]},
+            }
+        },
+        {"policy_kwargs": {"features_extractor_class": FlattenExtractor}},
         {"use_sde": False, "target_kl": 0.1, "stats_window_size": 5},
     ],
 )
@@ -219,3 +230,54 @@ def test_models_as_trainings_write_them_are_opened(tmp_path, options):
     for name in ("m.zip", "m_vecnormalize.pkl"):
         check_harmless(tmp_path / name)
     assert make_policy(str(tmp_path / "m.zip"), SmallEnv(), 0)
+
+
+def test_a_model_with_functions_as_schedules_acts_without_them(tmp_path):
+    path, mark = tmp_path / "m.zip", tmp_path / "ran"
+    model = ppo(clip_range=lambda progress: 0.2 * progress, clip_range_vf=lambda progress: 0.5)
+    model.learn(64)
+    model.learning_rate = model.lr_schedule = Runs(mark, "mkdir")
+    model.save(path)
+    found = make_policy(str(path), SmallEnv(), 0).predict(OBSERVATIONS, deterministic=True)[0]
+    np.testing.assert_array_equal(found, model.predict(OBSERVATIONS, deterministic=True)[0])
+    assert not mark.exists()
+    # Who trains on needs them.
+    with pytest.raises(PolicyError, match=r"m\.zip: opening it would run code"):
+        load_model(path, env=model.env)
+    assert not mark.exists()
+
+
+class Forged:
+    """Pickles as any call, and any state of what it returns."""
+
+    def __init__(self, *how):
+        self.how = how
+
+    def __reduce__(self):
+        return self.how
+
+
+def addresses_as_objects():
+    """An array of objects whose addresses are the pickle's own numbers: looking at one ends the process."""
+    kind = Forged(np.dtype, ("O8", False, True), (3, "|", None, None, None, 8, 8, 0))
+    content = struct.pack("<4Q", *[0x4141414141414141] * 4)
+    array = Forged(np.ones(1).__reduce__()[0], (np.ndarray, (0,), b"b"), (1, (4,), kind, False, content))
+    return pickle.dumps(Forged(deque, (array,)))
+
+
+def another_class_attribute():
+    return b"\x80\x04cstable_baselines3.common.utils\nLinearSchedule\nN}X\x04\x00\x00\x00evilK\x01s\x86b."
+
+
+@pytest.mark.parametrize("make", [addresses_as_objects, another_class_attribute])
+def test_looking_at_a_forged_pickle_makes_nothing(tmp_path, make):
+    (tmp_path / "s.pkl").write_bytes(make())
+    with pytest.raises(PolicyError, match=r"s\.pkl: expected the statistics"):
+        check_harmless(tmp_path / "s.pkl")
+    assert not hasattr(LinearSchedule, "evil")
+
+
+def test_a_model_of_another_algorithm_is_named(tmp_path):
+    DQN("MlpPolicy", SmallEnv(), buffer_size=64, learning_starts=8, device="cpu").learn(16).save(tmp_path / "d.zip")
+    with pytest.raises(PolicyError, match=r"d\.zip: expected a PPO model of .*, found one with .*DQNPolicy"):
+        make_policy(str(tmp_path / "d.zip"), SmallEnv(), 0)

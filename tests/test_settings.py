@@ -79,3 +79,10 @@ def test_what_does_not_fit_together_or_has_no_such_value_is_refused(change, word
 def test_the_environments_own_overrides_are_held_too():
     with pytest.raises(UsageError, match="tolerance_m: expected a number from 0 to 1, got nan"):
         gymnasium.make("avp_habitat:AVP-v0", scene="builtin:0", tolerance_m=math.nan)
+
+
+def test_a_budget_is_one_whose_steps_can_be_counted():
+    """The step that first saw a cell is kept in 16 bits, and would be negative beyond."""
+    assert TaskSettings(budget=32767).budget == np.iinfo(np.int16).max
+    with pytest.raises(UsageError, match="budget: expected a whole number from 1 to 32,767, got 32768"):
+        TaskSettings(budget=32768)

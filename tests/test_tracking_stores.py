@@ -17,6 +17,7 @@ from tracking import mlflow_home
 from avp_habitat import command
 from avp_habitat.tracking import compare
 from avp_habitat.tracking.addresses import TrackingError, absolute, connect
+from avp_habitat.tracking.database import address_of, file_of
 from avp_habitat.tracking.experiments import experiment_id, meant
 from avp_habitat.tracking.opening import NewRun, start_run
 
@@ -182,3 +183,15 @@ def test_a_database_that_another_program_left_half_made_is_recognised(store, tmp
     copy = path.rename(tmp_path / "half.db")
     with pytest.raises(TrackingError, match=f"a program was killed while it made the database.*{told}"):
         connect(f"sqlite:///{copy}")
+
+
+@pytest.mark.parametrize("folder", ["my runs", "100% ü", "a%20b", "q?x#y"])
+def test_a_database_is_made_where_mlflow_looks_for_it_whatever_its_path_holds(tmp_path, folder):
+    """SQLAlchemy reads `%20` in an address as a space."""
+    path = tmp_path / folder / "mlflow.db"
+    address = address_of(path)
+    assert file_of(address) == path
+    assert absolute(address) == address
+    made = connect(address).create_experiment("é")
+    assert [each.name for each in (tmp_path / folder).iterdir()] == ["mlflow.db"]
+    assert MlflowClient(address).get_experiment(made).name == "é"

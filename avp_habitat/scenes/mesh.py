@@ -64,23 +64,6 @@ def merge(parts: list[TexturedMesh]) -> TexturedMesh:
     )
 
 
-def fan_corners(lengths: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Polygons as fans of triangles about their first corners.
-
-    Args:
-        lengths: `(n,)` corners of each polygon, whose corners follow one another.
-
-    Returns:
-        `(t, 3)` places of the triangles' corners in the list of all corners, and `(t,)` the polygons they are of.
-    """
-    lengths = np.asarray(lengths, np.int64)
-    each = np.maximum(lengths - 2, 0)
-    polygons = np.repeat(np.arange(len(lengths)), each)
-    first = (np.cumsum(lengths) - lengths)[polygons]
-    step = np.arange(len(polygons)) - (np.cumsum(each) - each)[polygons]
-    return np.stack([first, first + step + 1, first + step + 2], axis=1), polygons
-
-
 def _kept_once(pictures: list[list[NDArray]]) -> tuple[list[NDArray], list[NDArray[np.int32]]]:
     """All different pictures, and for each list the new indices of its own, -1 staying -1."""
     every = {id(picture): picture for own in pictures for picture in own}

@@ -8,6 +8,8 @@ _NEUTRAL = ("-bm", "-blendu", "-blendv", "-boost", "-cc", "-imfchan", "-texres",
 """Options that say nothing of a plain colour picture."""
 _LOST = ("map_ka", "map_ke", "map_d")
 """Textures that are not shown."""
+_LOST_NUMBERS = ("d", "ke")
+"""Opacity and emitted light, which are not shown either; 1 and 0 where there is nothing to show."""
 
 
 @dataclass
@@ -47,8 +49,8 @@ class MaterialLibrary:
             self._take_diffuse(rest)
         elif key == "map_kd":
             _take_texture(self._newest, rest)
-        elif key in _LOST:
-            self._newest.lost.append(word)
+        elif key in _LOST or (key in _LOST_NUMBERS and _is_lost(key, rest)):
+            self._newest.lost.append(word if key in _LOST else f"{word} {rest}")
 
     def _take_diffuse(self, rest: str) -> None:
         words = rest.split()
@@ -89,6 +91,11 @@ def _values(text: str, most: int | None) -> tuple[list[str], str]:
         values.append(word)
         text = more[0] if more else ""
     return values, text
+
+
+def _is_lost(key: str, rest: str) -> bool:
+    numbers = [float(word) for word in rest.split() if _is_number(word)]
+    return any(number < 1 if key == "d" else number > 0 for number in numbers)
 
 
 def _is_number(word: str) -> bool:

@@ -1,22 +1,24 @@
 """Reads Wavefront OBJ files into one TexturedMesh."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles, decode_picture
-from avp_habitat.scenes.mesh import TexturedMesh, fan_corners
+from avp_habitat.scenes.mesh import TexturedMesh
 from avp_habitat.scenes.mtl import Material, MaterialLibrary
 from avp_habitat.scenes.notices import say_once
+from avp_habitat.scenes.polygons import triangulate
 
 _MOST = 2**31 - 1
 """What an index of 32 bits can hold."""
 
 
 def read_obj(files: SceneFiles) -> TexturedMesh:
-    """The polygons of an `.obj` file as fans of triangles, float64 positions in the file's axes.
+    """The polygons of an `.obj` file as triangles, float64 positions in the file's axes.
 
     Colours are texture × `Kd` × vertex colour (`v x y z r g b`).
 
@@ -38,7 +40,7 @@ def read_lines(name: str, content: bytes, take: Callable[[str, str], None]) -> N
         SceneError: `take` raised a ValueError; the text names the line.
     """
     before = ""
-    for number, raw in enumerate(content.decode("utf-8", "surrogateescape").split("\n"), start=1):
+    for number, raw in enumerate(content.decode("utf-8-sig", "surrogateescape").split("\n"), start=1):
         line = f"{before} {raw}".strip() if before else raw.strip()
         before = line[:-1] if line.endswith("\\") else ""
         if before or not line or line.startswith("#"):
@@ -83,13 +85,17 @@ class _Reader:
         Raises:
             SceneError: there are none, one names a vertex that is not there, or a picture cannot be read.
         """
-        places, polygons = fan_corners(np.array(self._lengths, np.int64))
+        corners = np.array(self._corners, np.int64).reshape(-1, 2)
+        for column, (kind, count) in enumerate((("v", len(self._positions)), ("vt", len(self._coordinates)))):
+            if corners[:, column].max(initial=-1) >= count:
+                raise SceneError(f"{self._files.path}: a face names {kind} {corners[:, column].max() + 1} of {count}")
+        positions = np.array(self._positions, np.float64).reshape(-1, 3)
+        try:
+            places, polygons = triangulate(np.array(self._lengths, np.int64), corners[:, 0], positions)
+        except ValueError as error:
+            raise SceneError(f"{self._files.path}: {error}") from None
         if not len(places):
             raise SceneError(f"{self._files.path}: expected a mesh with triangles, found none")
-        corners = np.array(self._corners, np.int64)
-        for column, (kind, count) in enumerate((("v", len(self._positions)), ("vt", len(self._coordinates)))):
-            if corners[:, column].max() >= count:
-                raise SceneError(f"{self._files.path}: a face names {kind} {corners[:, column].max() + 1} of {count}")
         material = np.array(self._materials, np.int64)[polygons]
         # One vertex for each combination of position, texture coordinate and material.
         parts = np.stack([*corners[places].reshape(-1, 2).T, np.repeat(material, 3)])
@@ -100,7 +106,7 @@ class _Reader:
         slots, textures = self._textures(materials)
         textured = (corners[places][..., 1] >= 0).all(axis=1)
         return TexturedMesh(
-            np.array(self._positions, np.float64)[position],
+            positions[position],
             triangles.reshape(-1, 3).astype(np.int32),
             self._uv(coordinate - 1, of_vertex, materials),
             self._colours(position, of_vertex, materials),
@@ -109,19 +115,19 @@ class _Reader:
         )
 
     def _vertex(self, rest: str) -> None:
-        numbers = [float(word) for word in rest.split()]
+        numbers = [float(word) for word in _data(rest)]
         if len(numbers) < 3:
             raise ValueError(f"expected three coordinates for every vertex, got {len(numbers)}")
         self._positions.append(numbers[:3])
         self._light.append(numbers[3:6] if len(numbers) >= 6 else [1.0, 1.0, 1.0])
 
     def _coordinate(self, rest: str) -> None:
-        numbers = [float(word) for word in rest.split()[:2]]
+        numbers = [float(word) for word in _data(rest)[:2]]
         self._coordinates.append((numbers + [0.0, 0.0])[:2])
 
     def _face(self, rest: str) -> None:
         """Corners `v`, `v/vt`, `v//vn` or `v/vt/vn`."""
-        words = rest.split()
+        words = _data(rest)
         for word in words:
             vertex, _, more = word.partition("/")
             coordinate = more.partition("/")[0]
@@ -152,6 +158,9 @@ class _Reader:
         if material is None:
             say_once(path, f"its material {name!r} is in none of its libraries and is shown white")
             return Material()
+        if material.picture and not any(material.diffuse):
+            say_once(path, f"its material {name!r} has a picture and a black Kd, which is taken for white")
+            material = replace(material, diffuse=[1.0, 1.0, 1.0])
         if material.lost:
             say_once(path, f"of its material {name!r}, {', '.join(material.lost)} is not followed")
         return material
@@ -177,6 +186,11 @@ class _Reader:
         light /= 255 if light.max() > 2 else 1
         diffuse = np.array([each.diffuse for each in materials], np.float64)
         return np.clip(light[position] * diffuse[of_vertex], 0, 1).astype(np.float32)
+
+
+def _data(rest: str) -> list[str]:
+    """The words of a line of numbers, a comment behind them apart."""
+    return rest.partition("#")[0].split()
 
 
 def _index(text: str, count: int) -> int:

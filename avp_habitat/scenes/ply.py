@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles, decode_picture
-from avp_habitat.scenes.mesh import TexturedMesh, fan_corners
+from avp_habitat.scenes.mesh import TexturedMesh
 from avp_habitat.scenes.notices import say_once
+from avp_habitat.scenes.polygons import triangulate
 
 _CODES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _CODES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
@@ -61,7 +62,7 @@ _Columns = dict[str, _Column]
 
 
 def read_ply(files: SceneFiles) -> TexturedMesh:
-    """The polygons of a `.ply` file as fans of triangles, float64 positions in the file's axes.
+    """The polygons of a `.ply` file as triangles, float64 positions in the file's axes.
 
     Colours are those of vertices, else those of faces; a texture is named by a comment `TextureFile NAME`.
 
@@ -92,13 +93,38 @@ def _tables(content: bytes) -> tuple[dict[str, _Columns], list[str]]:
         raise ValueError("truncated: expected a header that ends with end_header")
     lines = content[: end.start()].decode("utf-8", "replace").splitlines()
     order, elements, pictures = _header([line.split() for line in lines[1:] if line.strip()], lines)
-    body = content[end.end() :]
+    body = text = content[end.end() :]
     if order == "=":
-        body = _numbers(body)
+        body = _numbers(text)
     at, tables = 0, {}
     for element in elements:
         tables[element.name], at = _read(element, body, at)
+    if order == "=":
+        _check_lines(elements, tables, text)
     return tables, pictures
+
+
+def _check_lines(elements: list[_Element], tables: dict[str, _Columns], text: bytes) -> None:
+    """Refuse a text in which a row lacks a number, or has one too many, that others then stood for.
+
+    Raises:
+        ValueError: there are as many lines as rows, and one holds not what its row needs.
+    """
+    rows = [np.zeros(0, np.int64)]
+    for each in elements:
+        if columns := tables[each.name]:
+            rows.append(
+                np.sum([columns[one.name].lengths + (one.count is not None) for one in each.properties], axis=0)
+            )
+    expected = np.concatenate(rows)
+    characters = np.frombuffer(text, np.uint8)
+    begin = np.flatnonzero((characters > 32) & (np.append(32, characters[:-1]) <= 32))
+    line = np.searchsorted(np.flatnonzero((characters == 10) | (characters == 13)), begin)
+    found = np.diff(np.flatnonzero(np.diff(line, prepend=-1, append=-1)))
+    # Lines may be broken anywhere by who does not care for them.
+    if len(found) == len(expected) and (found != expected).any():
+        row = np.flatnonzero(found != expected)[0]
+        raise ValueError(f"line {row + 1} after the header has {found[row]} numbers; expected {expected[row]}")
 
 
 def _header(words: list[list[str]], lines: list[str]) -> tuple[str, list[_Element], list[str]]:
@@ -112,7 +138,7 @@ def _header(words: list[list[str]], lines: list[str]) -> tuple[str, list[_Elemen
                 raise ValueError(f"element {line[1]} has {line[2]} rows")
         elif line[0] == "property":
             elements[-1].properties.append(_property(line[1:], order))
-    pictures = [found[1].strip() for line in lines if (found := re.match(r"comment\s+TextureFile\s+(.+)", line))]
+    pictures = [found[1].strip() for line in lines if (found := re.match(r"(?i)comment\s+TextureFile\s+(.+)", line))]
     if not order:
         raise ValueError("the header names no format")
     return order, elements, pictures
@@ -210,12 +236,11 @@ def _mesh(files: SceneFiles, tables: dict[str, _Columns], pictures: list[str]) -
         raise SceneError(
             f"{files.path}: expected a mesh with triangles, found none, but {kinds or 'nothing'}; is it a point cloud?"
         )
-    corners, faces = fan_corners(listed.lengths)
-    triangles = listed.values.astype(np.int64)[corners]
-    if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(positions):
-        raise SceneError(
-            f"{files.path}: a face names vertices {triangles.min()} to {triangles.max()} of {len(positions)}"
-        )
+    named = listed.values.astype(np.int64)
+    if len(named) and not 0 <= named.min() <= named.max() < len(positions):
+        raise SceneError(f"{files.path}: a face names vertices {named.min()} to {named.max()} of {len(positions)}")
+    corners, faces = triangulate(listed.lengths, named, positions)
+    triangles = named[corners]
     colours, of_faces = _colours(vertex), _colours(face)
     wedges = _wedges(face, listed, corners)
     if (colours is None and of_faces is not None) or wedges is not None:

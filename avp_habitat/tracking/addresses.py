@@ -88,7 +88,7 @@ def absolute(address: str) -> str:
     file = database.file_of(address)
     if file is not None:
         options = address.partition("?")[1:]
-        return f"{database.SQLITE}{file}{''.join(options)}"
+        return f"{database.address_of(file)}{''.join(options)}"
     return address if urlsplit(address).scheme else str(Path(address).absolute())
 
 

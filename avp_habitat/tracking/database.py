@@ -12,9 +12,27 @@ _MAGIC = b"SQLite format 3\0"
 
 def file_of(address: str) -> Path | None:
     """The database file that an address names; None for other stores and for a database in memory."""
-    name = address.removeprefix(SQLITE).partition("?")[0]
+    name = _decoded(address) if "%" in address else address.removeprefix(SQLITE).partition("?")[0]
     in_file = address.startswith(SQLITE) and name not in ("", ":memory:") and not name.startswith("file:")
     return Path(name).absolute() if in_file else None
+
+
+def address_of(path: Path) -> str:
+    """What names a database file for MLflow, whatever characters its path has."""
+    if not set("%?#") & set(str(path)):
+        return f"{SQLITE}{path}"
+    from sqlalchemy.engine import URL
+
+    return URL.create("sqlite", database=str(path)).render_as_string()
+
+
+def _decoded(address: str) -> str:
+    """The path in an address; newer versions of SQLAlchemy read `%20` as a space there."""
+    if not address.startswith(SQLITE):
+        return ""
+    from sqlalchemy.engine import make_url
+
+    return make_url(address).database or ""
 
 
 def fault_of(path: Path) -> str | None:
@@ -49,7 +67,7 @@ def make(path: Path) -> None:
     # One name for each machine that shares the folder, so that what a killed program left is found and made anew.
     part = path.with_name(f".{path.name}.{socket.gethostname()}-{os.getuid()}.part")
     _remove(part)
-    engine = utils.create_sqlalchemy_engine(f"{SQLITE}{part}")
+    engine = utils.create_sqlalchemy_engine(address_of(part))
     try:
         utils._initialize_tables(engine)
         engine.dispose()

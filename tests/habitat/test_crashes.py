@@ -315,7 +315,7 @@ STEPPING = """
 from avp_habitat.env import AVPEnv
 from avp_habitat.simulators import make_simulator
 
-env = AVPEnv(simulator=make_simulator("habitat", room), budget=100_000, width=64, height=48)
+env = AVPEnv(simulator=make_simulator("habitat", room), budget=30_000, width=64, height=48)
 env.reset(seed=0)
 """
 ENDINGS = {
