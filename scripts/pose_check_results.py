@@ -1,7 +1,7 @@
 """Measure how often the pose checks refuse a correct rollout, and how small a fault they catch.
 
 Rollout NUMBER is drawn at random from its number: room, policy, size of the pictures and budget; NUMBER is its seed.
-Every rollout is checked as it is; every `--faults-every`-th also with small faults and with two of the known mistakes.
+Every rollout is checked as it is; the first `--damaged` also with small faults and with two of the known mistakes.
 What was judged already is read again from `--work`: a run that was stopped goes on.
 """
 
@@ -190,7 +190,7 @@ def measure_all(options: argparse.Namespace) -> list[dict[str, Any]]:
                 measure,
                 draw(number, options.scene),
                 options.work,
-                faults=(number - options.first) % options.faults_every == 0,
+                faults=number - options.first < options.damaged,
             )
             for number in numbers
         ]
@@ -341,7 +341,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--scene", nargs="*", default=[], metavar="FILE", help="rooms besides the built-in ones")
     add("--rollouts", default=150, type=int, help="how many")
     add("--first", default=1000, type=int, metavar="NUMBER", help="the first one's number")
-    add("--faults-every", default=5, type=int, metavar="N", help="damage every N-th rollout too")
+    add("--damaged", default=30, type=int, help="how many of them, the first ones, are damaged too")
     add("--jobs", default=os.cpu_count(), type=int, help="processes")
     add("--work", default=Path("runs/pose-checks"), type=Path, help="rollouts and what was judged")
     add("--out", default=Path("docs/results/pose_checks"), type=Path, help="tables")
@@ -358,9 +358,9 @@ def main(argv: Sequence[str]) -> None:
     for scene in options.scene:
         if not Path(scene).is_file():
             raise UsageError(f"--scene {scene}: expected a file, found none")
-    for name in ("rollouts", "faults_every", "jobs"):
+    for name in ("rollouts", "jobs"):
         if getattr(options, name) < 1:
-            raise UsageError(f"--{name.replace('_', '-')}: expected a whole number from 1")
+            raise UsageError(f"--{name}: expected a whole number from 1")
     options.work.mkdir(parents=True, exist_ok=True)
     found = measure_all(options)
     write_results(options, found, argv)
