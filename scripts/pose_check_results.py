@@ -1,7 +1,8 @@
 """Measure how often the pose checks refuse a correct rollout, and how small a fault they catch.
 
 Rollout NUMBER is drawn at random from its number: room, policy, size of the pictures and budget; NUMBER is its seed.
-Every rollout is checked as it is; the first `--damaged` also with small faults and with two of the known mistakes.
+Every rollout is checked as it is; every fifth, until there are `--damaged` of them, also with small faults and with two of
+the known mistakes.
 What was judged already is read again from `--work`: a run that was stopped goes on.
 """
 
@@ -47,6 +48,7 @@ SIZES = {(160, 120): 0.6, (320, 240): 0.28, (640, 480): 0.12}
 """With what share of the rollouts has pictures of this size."""
 BUDGETS = (10, 20, 30, 40, 60, 80)
 HELDOUT = 8
+DAMAGED_EVERY = 5
 CHECKS = ("depth agreement", "ICP correction", "reprojection", "relative poses")
 """Those that look at the data; the format check sees every change of a pose in `steps.csv` besides."""
 KNOWN = (*FAULTS, *MORE_FAULTS)
@@ -184,13 +186,14 @@ def _faulty(rollout: Rollout, known: Known, folder: Path, number: int) -> Iterat
 def measure_all(options: argparse.Namespace) -> list[dict[str, Any]]:
     """Measure every number, each process one after the other."""
     numbers = range(options.first, options.first + options.rollouts)
+    damaged = numbers[::DAMAGED_EVERY][: options.damaged]
     with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
         waiting = [
             pool.submit(
                 measure,
                 draw(number, options.scene),
                 options.work,
-                faults=number - options.first < options.damaged,
+                faults=number in damaged,
             )
             for number in numbers
         ]
@@ -341,7 +344,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--scene", nargs="*", default=[], metavar="FILE", help="rooms besides the built-in ones")
     add("--rollouts", default=150, type=int, help="how many")
     add("--first", default=1000, type=int, metavar="NUMBER", help="the first one's number")
-    add("--damaged", default=30, type=int, help="how many of them, the first ones, are damaged too")
+    add("--damaged", default=30, type=int, help="how many of them are damaged too, every fifth at most")
     add("--jobs", default=os.cpu_count(), type=int, help="processes")
     add("--work", default=Path("runs/pose-checks"), type=Path, help="rollouts and what was judged")
     add("--out", default=Path("docs/results/pose_checks"), type=Path, help="tables")
