@@ -1,8 +1,8 @@
 """Measure how often the pose checks refuse a correct rollout, and how small a fault they catch.
 
 Rollout NUMBER is drawn at random from its number: room, policy, size of the pictures and budget; NUMBER is its seed.
-Every rollout is checked as it is; every fifth, until there are `--damaged` of them, also with small faults and with two of
-the known mistakes.
+Every rollout is checked as it is; every fifth, until there are `--damaged` of them, also with small faults and with two
+of the known mistakes.
 What was judged already is read again from `--work`: a run that was stopped goes on.
 """
 
@@ -184,7 +184,7 @@ def _faulty(rollout: Rollout, known: Known, folder: Path, number: int) -> Iterat
 
 
 def measure_all(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Measure every number, each process one after the other."""
+    """Measure every number, one per process at a time."""
     numbers = range(options.first, options.first + options.rollouts)
     damaged = numbers[::DAMAGED_EVERY][: options.damaged]
     with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
