@@ -1,6 +1,5 @@
 """Reading and writing the PNG files of a rollout."""
 
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -22,18 +21,17 @@ def encode_depth(depth: NDArray[np.floating]) -> NDArray[np.uint16]:
 
 def write_rgb(path: Path, rgb: NDArray[np.uint8]) -> None:
     """Write `(height, width, 3)` uint8 as PNG."""
-    # Runs of equal bytes only: faster than a search for longer repeats, which rendered pictures hardly have.
-    path.write_bytes(encode_png(rgb, RGB_8, level=1, strategy=zlib.Z_RLE))
+    path.write_bytes(encode_png(rgb, RGB_8))
 
 
 def write_depth(path: Path, depth: NDArray[np.floating]) -> None:
     """Write `(height, width)` planar depth in metres as 16-bit PNG in millimetres."""
-    path.write_bytes(encode_png(encode_depth(depth), GREY_16, level=1, strategy=zlib.Z_DEFAULT_STRATEGY))
+    path.write_bytes(encode_png(encode_depth(depth), GREY_16))
 
 
 def write_numbers(path: Path, numbers: NDArray[np.uint16]) -> None:
     """Write `(height, width)` whole numbers as 16-bit grey PNG."""
-    path.write_bytes(encode_png(numbers, GREY_16, level=9, strategy=zlib.Z_DEFAULT_STRATEGY))
+    path.write_bytes(encode_png(numbers, GREY_16))
 
 
 def read_numbers(path: Path) -> NDArray[np.uint16]:

@@ -15,7 +15,7 @@ from avp_habitat.ranges import Range, number
 
 Float = NDArray[np.floating]
 
-_SIDE, _HFOV_DEG = Range(1, 16_384), Range(1, 175)
+_SIDE, _HFOV_DEG = Range(1, 16_384), Range(0.001, 179)
 _FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 

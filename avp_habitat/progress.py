@@ -39,4 +39,6 @@ def progress(work: Iterable[Any] | None = None, **options: Any) -> tqdm:
     """
     if sys.stderr.isatty():
         return tqdm(work, **options)
-    return tqdm(work, file=_Lines(), mininterval=SECONDS, maxinterval=SECONDS, bar_format=_LINE, **options)
+    # At position 0 no bar moves the cursor because of other bars.
+    options |= {"file": _Lines(), "position": 0, "bar_format": _LINE}
+    return tqdm(work, mininterval=SECONDS, maxinterval=SECONDS, **options)

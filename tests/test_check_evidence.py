@@ -7,11 +7,14 @@ import pytest
 from picture_walk import CAMERA, walk_poses, write_walk
 from wall_walk import TURNING, WALKING, write_wall
 
+from avp_habitat.poses import camera_to_world
 from avp_habitat.rollout import read_rollout
 from avp_nerfstudio.check.__main__ import Request, check
 from avp_nerfstudio.check.pictures import check_pictures, judge
+from avp_nerfstudio.check.pictures_causes import best_focal_factor
 from avp_nerfstudio.check.pictures_frames import gain_limit
 from avp_nerfstudio.check.pictures_matching import match_pictures
+from avp_nerfstudio.check.pictures_rays import Stacked
 
 POSES = walk_poses()
 ALL = np.ones(len(POSES), bool)
@@ -94,3 +97,33 @@ def test_exchanged_picture_files_are_named_by_the_whole_check(tmp_path):
     causes = {verdict.cause for verdict in verdicts.values() if not verdict.passed}
     assert causes == {"the pictures of frames 4 and 9 look exchanged: the depth proves the poses right"}
     assert len(read_rollout(folder).frames) == len(POSES)
+
+
+def turned_pairs(factors):
+    """Pairs of pictures 20 degrees apart whose matches were made with the focal length times a factor; 0: no turn."""
+    yaw = np.radians([20.0 if factor else 0.0 for factor in factors])
+    yaw = np.concatenate([np.zeros(len(yaw)), yaw])
+    poses = camera_to_world(np.zeros((len(yaw), 3)), yaw=yaw, pitch=np.zeros(len(yaw)))
+    first = np.random.default_rng(0).uniform([20, 20], [200, 220], size=(30, 2))
+    second = []
+    for pose, factor in zip(poses[len(factors) :], factors, strict=True):
+        rays = np.stack([first[:, 0] - CAMERA.cx, CAMERA.cy - first[:, 1], np.full(30, -(factor or 1) * CAMERA.fx)], 1)
+        x, y, z = (rays @ pose[:3, :3]).T
+        away = -(factor or 1) * CAMERA.fx / z
+        second.append(np.stack([CAMERA.cx + x * away, CAMERA.cy - y * away], 1))
+    count = len(factors)
+    pixels = np.array([np.tile(first, (count, 1)), np.concatenate(second)])
+    pair, number = np.repeat(np.arange(count), 30), np.arange(count)
+    start, matched = 30 * np.arange(count + 1), np.full(count, 30)
+    return Stacked(pair, number, number + count, start, matched, pixels), poses
+
+
+@pytest.mark.parametrize("factor", [0.97, 0.99, 1.01, 1.03])
+def test_a_focal_length_that_suits_all_pairs_is_found(factor):
+    stacked, poses = turned_pairs([factor] * 20)
+    assert best_focal_factor(stacked, poses, CAMERA) == pytest.approx(factor, abs=0.001)
+
+
+def test_one_pair_beside_many_that_stand_still_is_no_evidence_on_the_focal_length():
+    stacked, poses = turned_pairs([0.0] * 20 + [1.2])
+    assert best_focal_factor(stacked, poses, CAMERA) == 1.0

@@ -158,7 +158,7 @@ def test_a_model_of_another_environment_is_refused(tmp_path, capfd):
         ({"--scene": "builtin:first"}, 2, "builtin:first: expected builtin:SEED"),
         ({"--scene": "nowhere.glb"}, 1, "nowhere.glb: no such scene file"),
         ({"--scene": "room.xyz"}, 2, "room.xyz: expected a scene file"),
-        ({"--budget": "0"}, 2, "budget: expected a number above 0, got 0"),
+        ({"--budget": "0"}, 2, "budget: expected a whole number from 1 to 32,767, got 0"),
         ({"--width": "4"}, 2, "--width: expected 8 to 8192 pixels, got 4"),
         ({"--seed": "-1"}, 2, "--seed: expected a whole number from 0, got -1"),
     ],

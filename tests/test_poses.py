@@ -102,7 +102,7 @@ def test_the_field_of_view_ends_at_the_image_border():
 
 @pytest.mark.parametrize("hfov_deg", [0, 180, -20, float("nan"), float("inf"), "90"])
 def test_an_impossible_field_of_view_is_refused(hfov_deg):
-    with pytest.raises(UsageError, match=r"^hfov_deg: expected a number from 1 to 175, got"):
+    with pytest.raises(UsageError, match=r"^hfov_deg: expected a number from 0.001 to 179, got"):
         Intrinsics.from_hfov(64, 48, hfov_deg=hfov_deg)
 
 

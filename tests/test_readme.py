@@ -266,7 +266,7 @@ class Reader:
         if self._shell is None:
             with chdir(self.folder):
                 self._shell = self._stack.enter_context(Shell())
-        done = self._shell.run(*shlex.split(text), environment=self._environment)
+        done = self._shell.run(*shlex.split(text), environment=self._environment, cwd=self.folder)
         return done.returncode, done.stdout + done.stderr
 
     def _served(self, key):
