@@ -127,6 +127,7 @@ def read_meta(folder: Path) -> dict[str, Any]:
             f"avp-suite {writer}; collect it again or read it with that version"
         )
     _check_facts(path, meta)
+    _check_origin(path, _of(meta, "scene").get("origin", [0, 0, 0]))
     _intrinsics(path, meta)
     for key in ("frames", HELDOUT):
         _count(folder, meta, key)
@@ -245,6 +246,11 @@ def _check_facts(path: Path, meta: dict[str, Any]) -> None:
         for name, value in meta.get(key, {}).items():
             if name != "names" and (isinstance(value, bool) or not isinstance(value, int | float)):
                 raise RolloutError(f"{path}: expected {key}.{name} to be a finite number, found {reprlib.repr(value)}")
+
+
+def _check_origin(path: Path, origin: Any) -> None:
+    if not (isinstance(origin, list) and len(origin) == 3 and all(map(_is_finite, origin))):
+        raise RolloutError(f"{path}: expected scene.origin to be three lengths in metres, found {reprlib.repr(origin)}")
 
 
 def _of(meta: dict[str, Any], key: str) -> dict[str, Any]:

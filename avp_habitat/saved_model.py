@@ -3,6 +3,8 @@
 import base64
 import io
 import json
+import logging
+import math
 import pickle
 import re
 import zipfile
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import PolicyError
 
+_log = logging.getLogger(__name__)
 _NUMPY = "_reconstruct scalar _frombuffer"
 _KNOWN = {
     "collections": "deque OrderedDict",
@@ -65,6 +68,8 @@ _PLAIN_TYPE = re.compile(r"[biufcSUO]\d+")
 _PICKLED = ":serialized:"
 _CHECKPOINT = re.compile(r"(?P<name>.+)_(?P<steps>\d+)_steps")
 _DATA = "data"
+# Statistics see every step of their training, and those of its end serve for its best model too.
+_ENOUGH = 0.9
 # Of the last reset before normalisation; Stable-Baselines3 keeps it only where the environment is normalised.
 _TELLS_NORMALISED = "_last_original_obs"
 # Off-policy algorithms, which have none, keep it always.
@@ -243,6 +248,13 @@ def load_statistics(path: Path, space: Any, *, trusted: bool = False) -> Any:
     return found
 
 
+def _observations(statistics: Any) -> float:
+    """From how many observations statistics were computed; infinity where they do not count."""
+    found = statistics.obs_rms if statistics.norm_obs else None
+    counts = found.values() if isinstance(found, dict) else [found]
+    return min((each.count for each in counts if each is not None), default=math.inf)
+
+
 class NormalisedPolicy:
     """A model that sees observations as in its training under `VecNormalize`."""
 
@@ -253,6 +265,14 @@ class NormalisedPolicy:
             PolicyError: as `load_statistics`.
         """
         self._model, self._statistics = model, load_statistics(statistics, model.observation_space, trusted=trusted)
+        seen, steps = _observations(self._statistics), model.num_timesteps
+        if seen < _ENOUGH * steps:
+            _log.warning(
+                "%s: computed from %.0f observations, but the model was trained for %d steps: are they its own?",
+                statistics,
+                seen,
+                steps,
+            )
         self.avp_mlflow_run_id = getattr(model, "avp_mlflow_run_id", None)
 
     def predict(

@@ -1,5 +1,7 @@
 """OBJ files and their material libraries as modelling programs write them."""
 
+import os
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -176,3 +178,20 @@ def test_a_black_factor_leaves_a_picture_as_it_is(tmp_path, caplog):
     mesh = load_scene(write(tmp_path, text, "newmtl a\nKd 0 0 0\nmap_Kd map.png\n")).mesh
     assert (mesh.colours == 1).all()
     assert "its material 'a' has a picture and a black Kd, which is taken for white" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("queue.png", r"queue.png \(referred to by room.obj\): expected a file, found something else"),
+        ("endless.png", r"endless.png \(referred to by room.obj\): expected a file, found something else"),
+        ("a\0b.png", "which is no name of a file"),
+        ("x" * 5000, "cannot be read: File name too long"),
+    ],
+)
+def test_a_picture_that_never_ends_or_has_no_name_is_named(tmp_path, name, message):
+    os.mkfifo(tmp_path / "queue.png")
+    (tmp_path / "endless.png").symlink_to("/dev/zero")
+    text = "mtllib room.mtl\nusemtl a\nvt 0 0\n" + vertices(CORNERS) + "f 1/1 2/1 3/1\n"
+    with pytest.raises(SceneError, match=message):
+        load_scene(write(tmp_path, text, f"newmtl a\nmap_Kd {name}\n"))

@@ -279,6 +279,10 @@ DAMAGES = {
         lambda f: edit_json(f / "rollout.json", lambda j: j["camera"].update(fx=10**400)),
         "camera.fx to be a finite number, found 1000",
     ),
+    "an origin of two numbers": (
+        lambda f: edit_json(f / "rollout.json", lambda j: j.update(scene={"name": "a", "origin": [1.0, 2.0]})),
+        r"scene.origin to be three lengths in metres, found \[1.0, 2.0\]",
+    ),
     "nested without end": (lambda f: (f / "rollout.json").write_text("[" * 100_000), "rollout.json: expected JSON"),
     "image cut short": (lambda f: cut_short(f, "images/frame_00002.png"), "frame_00002.png: .* without an end"),
     "depth cut short": (lambda f: cut_short(f, "heldout/depth/frame_00001.png"), "frame_00001.png: .* without an end"),

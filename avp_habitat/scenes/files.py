@@ -1,5 +1,6 @@
 """The files that a scene consists of: confined to its folder and remembered for its digest."""
 
+import errno
 import hashlib
 import io
 import os
@@ -60,11 +61,19 @@ class SceneFiles:
         return content.hexdigest()
 
     def _read(self, path: Path) -> bytes:
+        owner = "" if path == self.path else f" (referred to by {self.path.name})"
         try:
+            # A link may lead to what never ends, too.
+            if path.exists() and not path.is_file():
+                raise SceneError(f"{path}{owner}: expected a file, found something else (a folder, a device, …)")
             return path.read_bytes()
+        except ValueError as error:
+            raise SceneError(f"{self.path}: refers to {path.name!r}, which is no name of a file: {error}") from None
         except OSError as error:
-            owner = "" if path == self.path else f" (referred to by {self.path.name})"
-            raise SceneError(f"{path}{owner}: {broken_link(path) or f'cannot be read: {error.strerror}'}") from error
+            reason = f"cannot be read: {error.strerror}"
+            if error.errno != errno.ENAMETOOLONG:
+                reason = broken_link(path) or reason
+            raise SceneError(f"{path}{owner}: {reason}") from error
 
 
 def check_memory(name: str, needed: int) -> None:

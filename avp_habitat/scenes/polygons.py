@@ -34,12 +34,36 @@ def triangulate(
     first = start[polygons]
     step = np.arange(len(polygons)) - begin[polygons]
     places = np.stack([first, first + step + 1, first + step + 2], axis=1)
-    many = np.flatnonzero(lengths > 3)
-    for some in np.array_split(many, len(many) // _AT_ONCE + 1):
+    for some in _portions(np.flatnonzero(lengths == 4)):
+        at = start[some]
+        turned = some[_is_bent(*(positions[corners[at + step]].astype(np.float64) for step in range(4)))]
+        # The other diagonal.
+        places[begin[turned]] = start[turned, None] + [1, 2, 3]
+        places[begin[turned] + 1] = start[turned, None] + [1, 3, 0]
+    for some in _portions(np.flatnonzero(lengths > 4)):
         _cut(
             some, lengths[some], start[some], begin[some], lambda at: positions[corners[at]].astype(np.float64), places
         )
     return places, polygons
+
+
+def _portions(indices: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    return np.array_split(indices, len(indices) // _AT_ONCE + 1)
+
+
+def _is_bent(a: NDArray, b: NDArray, c: NDArray, d: NDArray) -> NDArray[np.bool_]:
+    """`(n,)` whether the diagonal from a to c lies outside of a quad: its halves face different ways."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        across = c - a
+        one, two = _crossed(b - a, across), _crossed(across, d - a)
+        whole = one + two
+        least = np.minimum((one * whole).sum(axis=1), (two * whole).sum(axis=1))
+        return least < -_STRAIGHT * (whole * whole).sum(axis=1)
+
+
+def _crossed(one: NDArray, two: NDArray) -> NDArray:
+    (x, y, z), (u, v, w) = one.T, two.T
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
 
 
 def _cut(
@@ -56,19 +80,14 @@ def _cut(
     own = np.arange(len(of)) - (end - lengths)[of]
     here, before, after = (points(start[of] + (own + step) % lengths[of]) - points(start[of]) for step in (0, -1, 1))
     with np.errstate(over="ignore", invalid="ignore"):
-        crossed = np.cross(here, after)
+        crossed = _crossed(here, after)
         normals = np.zeros((len(some), 3))
         for axis in range(3):
             normals[:, axis] = np.bincount(of, crossed[:, axis], len(some))
-        turns = (np.cross(here - before, after - here) * normals[of]).sum(axis=1)
+        turns = (_crossed(here - before, after - here) * normals[of]).sum(axis=1)
         wrong = turns < -_STRAIGHT * (normals**2).sum(axis=1)[of]
     count = np.bincount(of[wrong], minlength=len(some))
-    # A quad with one such corner is a fan about that one.
-    about = np.flatnonzero(wrong & (lengths == 4)[of] & (count == 1)[of])
-    for triangle, steps in enumerate(((0, 1, 2), (0, 2, 3))):
-        turned = (own[about, None] + steps) % 4
-        places[begin[of[about]] + triangle] = start[of[about], None] + turned
-    for index in np.flatnonzero((count > 0) & (lengths > 4)):
+    for index in np.flatnonzero(count):
         if lengths[index] > _MOST_CORNERS:
             raise ValueError(
                 f"polygon {some[index] + 1} is not convex and has {lengths[index]} corners; expected {_MOST_CORNERS} "
