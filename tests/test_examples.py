@@ -181,6 +181,34 @@ def test_the_demo_compares_three_methods_and_is_not_repeated(tmp_path):
     assert "holds a demo with other settings" in other.stderr
 
 
+def test_a_stage_of_the_demo_is_waited_for_when_it_is_interrupted(tmp_path):
+    program = tmp_path / "stage.py"
+    program.write_text(
+        "import pathlib, signal, sys, time\n"
+        "def save(*_):\n"
+        "    time.sleep(1)\n"
+        "    pathlib.Path(sys.argv[1]).write_text('saved')\n"
+        "    sys.exit(130)\n"
+        "for number in (signal.SIGINT, signal.SIGTERM): signal.signal(number, save)\n"
+        "pathlib.Path(sys.argv[1] + '-began').touch()\n"
+        "time.sleep(60)\n"
+    )
+    code = (
+        "import pathlib, sys; sys.path.insert(0, sys.argv[1]); import demo\n"
+        "stage = demo.Demo(demo.Settings(), pathlib.Path('.'))\n"
+        "sys.exit(demo.command.run(lambda _: stage.run('s', 'python', *sys.argv[2:])))"
+    )
+    for number, whom, name in ((signal.SIGINT, os.killpg, "a"), (signal.SIGTERM, os.kill, "b")):
+        line = [sys.executable, "-c", code, str(ROOT / "examples"), str(program), name]
+        with subprocess.Popen(line, cwd=tmp_path, start_new_session=True) as process:
+            until = time.monotonic() + 60
+            while not (tmp_path / f"{name}-began").exists() and time.monotonic() < until:
+                time.sleep(0.05)
+            whom(process.pid, number)
+            assert process.wait(60) == 130
+        assert (tmp_path / name).read_text() == "saved"
+
+
 @pytest.mark.slow
 def test_a_normalised_training_goes_on_with_its_statistics_from_a_file_and_from_mlflow(tmp_path):
     settings = TaskSettings(lookup=True, width=16, height=12)
