@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from isal import isal_zlib
 from numpy.typing import NDArray
 
 from avp_habitat.errors import RolloutError
@@ -49,6 +48,9 @@ def encode_png(pixels: NDArray[np.unsignedinteger], kind: PngKind) -> bytes:
         pixels: `(height, width)` or `(height, width, channels)`, as `kind` says.
         kind: of the file.
     """
+    # Imported here, because most who import this module only read.
+    from isal import isal_zlib
+
     height, width = pixels.shape[:2]
     rows = np.ascontiguousarray(pixels, f">u{kind.bits // 8}").view(np.uint8).reshape(height, -1)
     lines = np.empty((height, 1 + rows.shape[1]), np.uint8)

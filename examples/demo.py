@@ -286,6 +286,7 @@ def main(argv: Sequence[str]) -> None:
     if reason := next((reason for _, reason in found if reason), None):
         print(f"\nLPIPS {NOT_COMPUTED}: {reason}")
     print(f"\ntable:        {demo.folder}/table.md, table.csv, table.json")
+    print(f"pictures:     {demo.folder}/rollouts/*/trajectory.png")
     print(f"compare runs: .venv/bin/mlflow ui --backend-store-uri {_TRACKING_URI}")
     print(f"trajectories: .venv/bin/rerun {recording}")
     print(f"training:     .venv/bin/rerun {demo.folder}/training.rrd")

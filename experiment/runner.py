@@ -12,6 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from avp_habitat.progress import progress
 from experiment.cells import COLLECT, RECONSTRUCT, TRAIN, Cell
 from experiment.execute import Order, execute, last_words
 from experiment.store import Store
@@ -65,11 +66,12 @@ class Runner:
             context.set_forkserver_preload(list(self.preload))
         running: list[_Running] = []
         done = len(cells) - len(waiting)
-        with tqdm(total=len(cells), initial=done, desc="experiment", unit="cell", bar_format=_BAR) as bar:
+        options = {"total": len(cells), "initial": done, "desc": "experiment", "unit": "cell", "bar_format": _BAR}
+        with progress(miniters=0, **options) as bar:
             try:
                 while waiting or running:
                     self._start(context, waiting, running)
-                    bar.set_postfix_str(self._state(waiting, running))
+                    bar.set_postfix_str(self._state(waiting, running), refresh=sys.stderr.isatty())
                     bar.update(self._collect(running))
                     bar.update(self._pass_over(waiting))
             except BaseException:
