@@ -119,3 +119,14 @@ def test_a_mistake_that_is_not_known_is_admitted(correct, tmp_path):
 
     geometry = check_geometry(read_rollout(write_faulty(correct, tmp_path / "faulty", Fault("noise", damage, ""))))
     assert "none of the known mistakes explains it" in cause_of(geometry)
+
+
+def test_every_frame_that_shows_enough_is_proved_right_but_one_that_is_off(correct, tmp_path):
+    right = check_geometry(read_rollout(correct), explain=False)
+    wrong = check_geometry(
+        read_rollout(write_faulty(correct, tmp_path / "faulty", off(6, np.array([0.0, 0.02, 0.0])))), explain=False
+    )
+    assert right.proved[6]
+    assert right.proved.mean() > 0.5
+    assert not wrong.proved[6]
+    assert not all(verdict.passed for verdict in wrong.verdicts)

@@ -32,6 +32,9 @@ CORRECTION_M = 0.005
 """Greatest shift by which ICP may still improve a frame; 0 in all correct rollouts that were tried."""
 CORRECTION_DEG = 0.2
 """Greatest rotation by which it may."""
+PROVED_SHARE = 0.95
+"""Single frames that agree less than their limit, but so much, are right where ICP, with all six directions fixed,
+leaves them: in one of 106 correct rollouts (160x120, where thin things lie between the pixels) a view had 0.977."""
 _LEAST_GAIN_M = 0.0005
 _REGISTERED = 100
 _NAMED = 5
@@ -51,7 +54,7 @@ class Geometry:
     bad: NDArray[np.bool_]
     """`(n,)` frames that disagree."""
     proved: NDArray[np.bool_]
-    """`(n,)` frames that agree, and whose surfaces fix all six directions in which their poses could be off."""
+    """`(n,)` frames that agree, or nearly so, that ICP leaves where they are; surfaces fix all their six directions."""
     diagnosis: Diagnosis | None
     """What explains the disagreement, where that is known."""
 
@@ -94,9 +97,11 @@ def check_geometry(
     comparison = Comparison(maps)
     agreement = comparison.full(given)
     bad = bad_frames(agreement, given.kept)
-    passed = agrees(agreement, given.kept)
     corrections = _corrections(comparison, given, agreement, bad)
-    proved = _proved(agreement, given, corrections) & ~bad
+    proved = _proved(agreement, given, corrections)
+    if bad.sum() <= _FEW:
+        bad &= ~proved
+    passed = not (agreement.share(given.kept) < AGREEING_SHARE or bad.any())
     diagnosis = None if passed or not explain else _diagnose(comparison, given, rollout, bad, corrections)
     hidden = _hidden_mistakes(comparison, given) if passed and explain else []
     verdicts = [
@@ -134,7 +139,7 @@ def _proved(agreement: Agreement, given: Cameras, corrections: dict[int, Correct
     fixed = np.zeros(len(given.poses), bool)
     for frame, correction in corrections.items():
         fixed[frame] = correction is not None and correction.fixed_directions == 6 and _small(correction)
-    return fixed & (compared >= LEAST_COMPARED) & (share >= AGREEING_SHARE_OF_FRAME)
+    return fixed & (compared >= LEAST_COMPARED) & (share >= PROVED_SHARE)
 
 
 def _small(correction: Correction) -> bool:
@@ -192,7 +197,7 @@ def _agreement_verdict(
     text = (
         f"{100 * agreement.share():.2f} % of {agreement.compared()} points seen twice agree within 2 cm "
         f"(limit {100 * AGREEING_SHARE} %); worst is {name_of(given, worst)} with {100 * share[worst]:.1f} % "
-        f"(limit {100 * AGREEING_SHARE_OF_FRAME:.0f} %)"
+        f"(limit {100 * AGREEING_SHARE_OF_FRAME:.0f} %, or {100 * PROVED_SHARE:.0f} % where ICP finds no better place)"
     )
     if hidden:
         text += f"; these views cannot show {', '.join(hidden)}"
