@@ -6,7 +6,8 @@ import pytest
 from PIL import Image
 
 from avp_habitat import images
-from avp_habitat.png import GREY_16, RGB_8, check_png_contents, check_png_structure, encode_png
+from avp_habitat.images import encode_png
+from avp_habitat.png import GREY_16, RGB_8, check_png_contents, check_png_structure
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout_writer import RolloutWriter
 
