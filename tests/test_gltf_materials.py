@@ -188,6 +188,19 @@ HOLE[..., 0] = 10
 WIDE, HIGH, DEEP = 4.0, 2.5, 3.0
 
 
+@pytest.mark.parametrize("wrap", [33071, 33648])
+@pytest.mark.parametrize("scale", [1, 3])
+def test_a_picture_that_is_not_repeated_beyond_its_edge_is_named(tmp_path, caplog, wrap, scale):
+    moved = INFO | {"extensions": {"KHR_texture_transform": {"scale": [scale, 1]}}}
+    document = with_picture(quad(), {"uri": data_uri(png(PICTURE))})
+    document.json["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": moved}}]
+    document.json["samplers"] = [{"wrapS": wrap}]
+    document.json["textures"][0]["sampler"] = 0
+    load_scene(document.write(tmp_path))
+    assert len(caplog.messages) == (scale > 1)
+    assert "clamped or mirrored beyond their edges are repeated there" in caplog.text or scale == 1
+
+
 def panes(*pixels: np.ndarray, at: float = 2.0, gap: float = 0.3, alpha: float = 1.0, **extra) -> Gltf:
     """A room of one colour, cut in two by masked panes, each with a picture of its own."""
     document = Gltf()

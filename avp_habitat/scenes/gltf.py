@@ -18,6 +18,9 @@ from avp_habitat.scenes.mesh import TexturedMesh, merge
 from avp_habitat.scenes.notices import say_once
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_REPEAT = 10497
+_EDGE = 0.01
+"""Texture coordinates so little beyond a picture's edge show hardly anything else."""
 _VERTEX_BYTES, _CORNER_BYTES = 160, 30
 """What reading takes at most for each vertex and each triangle's corner, copies included."""
 # What walking through a document raises where a field is missing, of another type or out of range.
@@ -184,10 +187,23 @@ class _Reader:
 
     def _coordinates(self, attributes: Any, surface: Surface, vertices: int) -> NDArray[np.float32] | None:
         accessor = None if surface.texture is None else getattr(attributes, surface.coordinates, None)
-        if accessor is None:
+        if accessor is None or surface.texture is None:
             return None
         uv = self._matching(accessor, surface.coordinates, vertices)[:, :2].astype(np.float32)
-        return uv if surface.transform is None else uv @ surface.transform[:, :2].T + surface.transform[:, 2]
+        if surface.transform is not None:
+            uv = uv @ surface.transform[:, :2].T + surface.transform[:, 2]
+        if self._is_wrapped_otherwise(surface.texture, uv):
+            say_once(str(self._path), "textures that are clamped or mirrored beyond their edges are repeated there")
+        return uv
+
+    def _is_wrapped_otherwise(self, texture: int, uv: NDArray[np.float32]) -> bool:
+        """Whether coordinates leave a picture that its sampler does not repeat there."""
+        sampler = self._document.textures[texture].sampler
+        if sampler is None:
+            return False
+        found: Any = self._document.samplers[sampler]
+        repeated = np.isin([found.wrapS or _REPEAT, found.wrapT or _REPEAT], _REPEAT)
+        return bool((((uv < -_EDGE) | (uv > 1 + _EDGE)) & ~repeated).any())
 
     def _colours(self, attributes: Any, surface: Surface, vertices: int) -> NDArray[np.float32]:
         """`(v, 4)` colours and alpha; integers count as fractions even where a file forgets to say so."""
