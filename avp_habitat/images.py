@@ -47,8 +47,9 @@ def _chunk(name: bytes, data: bytes) -> bytes:
 
 
 def encode_depth(depth: NDArray[np.floating]) -> NDArray[np.uint16]:
-    """Planar depth in metres, any shape, to whole millimetres; 0 stays "nothing", 65.535 m is the greatest."""
-    return np.clip(np.rint(depth / DEPTH_UNIT_M), 0, _MAX_STORED_DEPTH).astype(np.uint16)
+    """Planar depth in metres, any shape, to whole millimetres; 0 is "nothing", and so is what is beyond 65.535 m."""
+    millimetres = np.rint(depth / DEPTH_UNIT_M)
+    return np.where(millimetres <= _MAX_STORED_DEPTH, millimetres, 0).astype(np.uint16)
 
 
 def write_rgb(path: Path, rgb: NDArray[np.uint8]) -> None:

@@ -53,6 +53,11 @@ def _check_scene(first: Rollout, other: Rollout) -> None:
             f"{other.folder}: captured in the scene {_scene_text(two)}, but {first.folder} in {_scene_text(one)}; "
             "only rollouts of one scene can be merged"
         )
+    if _frame(one) != _frame(two):
+        raise RolloutError(
+            f"{other.folder}: its scene lies at {_frame_text(two)}, that of {first.folder} at {_frame_text(one)}; "
+            "collect one of them again, with the same --up"
+        )
 
 
 def _scene(rollout: Rollout) -> dict[str, Any]:
@@ -63,6 +68,16 @@ def _scene(rollout: Rollout) -> dict[str, Any]:
             f"merged, found scene {scene!r}"
         )
     return scene
+
+
+def _frame(scene: dict[str, Any]) -> tuple[list[float], str | None]:
+    """How a scene's file lies in the rollout's world."""
+    return scene.get("origin") or [0.0, 0.0, 0.0], scene.get("up")
+
+
+def _frame_text(scene: dict[str, Any]) -> str:
+    origin, up = _frame(scene)
+    return f"origin {origin} with {up or 'the usual axis'} up"
 
 
 def _scene_text(scene: dict[str, Any]) -> str:

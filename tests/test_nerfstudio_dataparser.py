@@ -170,6 +170,15 @@ def test_rollouts_of_different_scenes_are_not_merged(pair, tmp_path):
         parse(pair[0], also=(other,))
 
 
+@pytest.mark.parametrize("lies", [{"origin": [448000.0, 0.0, -5411000.0]}, {"up": "z"}])
+def test_rollouts_of_one_scene_that_lie_differently_are_not_merged(pair, lies):
+    edit(pair[1], lambda meta: meta["scene"].update(lies))
+    with pytest.raises(
+        RolloutError, match=r"two: its scene lies at origin \[.*one at origin \[0\.0, 0\.0, 0\.0\] with the"
+    ):
+        parse(pair[0], also=(pair[1],))
+
+
 def test_rollouts_of_different_cameras_are_not_merged(pair, tmp_path):
     wide = write_known_room(tmp_path / "wide", frames=1, width=40)
     text = r"wide/rollout\.json: pictures of 40x24 .*one/rollout\.json has 32x24 .*--width 32 --height 24"

@@ -70,9 +70,9 @@ def test_transforms_json_lists_every_view_once_with_its_split(rollout):
     assert all((rollout / frame["depth_file_path"]).is_file() for frame in transforms["frames"])
 
 
-def test_depth_is_kept_in_whole_millimetres_and_never_wraps():
+def test_depth_is_kept_in_whole_millimetres_and_what_does_not_fit_is_none():
     stored = images.encode_depth(np.array([0.0, 0.0004, 1.2345678, 65.535, 80.0]))
-    assert stored.tolist() == [0, 0, 1235, 65535, 65535]
+    assert stored.tolist() == [0, 0, 1235, 65535, 0]
 
 
 def test_an_existing_folder_is_refused_and_untouched(rollout):
