@@ -251,6 +251,16 @@ def test_rays_go_on_through_the_holes_of_a_masked_pane(tmp_path):
     assert seen.rgb[0, 24, 34:].tolist() == [[255, 255, 255]] * 30
 
 
+def test_no_rays_are_no_hits(tmp_path):
+    """As where nothing of the floor that is new to an agent lies in its picture, or nothing hides any of it."""
+    sim, none = simulator(tmp_path, panes(HOLE)), np.zeros((0, 3))
+    assert sim.distance(none, none).shape == (0,)
+    assert sim.surface_below(none).shape == (0,)
+    eye, ahead = np.array([[0.5, 1.25, 2.5]]), np.array([[1.0, 1.25, 2.5]])
+    assert sim.reached(eye, ahead, np.zeros((0, 2), int), tolerance_m=0.1).shape == (0,)
+    assert sim.reached(eye, ahead, np.array([[0, 0]]), tolerance_m=0.1).tolist() == [True]
+
+
 def test_single_rays_agree_with_the_picture(tmp_path):
     sim = simulator(tmp_path, panes(HOLE))
     origin, east = np.array([[0.5, 1.25, 0.5], [0.5, 1.25, 2.5]]), np.tile([1.0, 0, 0], (2, 1))

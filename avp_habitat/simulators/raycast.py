@@ -223,7 +223,7 @@ class _Rays:
         """First hits of `(..., 6)` rays: `t_hit` (inf for none), `primitive_ids`, `primitive_uvs`."""
         found = self._scene.cast_rays(self._tensor(rays))
         hits = {key: found[key].numpy() for key in ("t_hit", "primitive_ids", "primitive_uvs")}
-        if self._masked is not None:
+        if self._masked is not None and rays.size:
             self._go_on(rays.reshape(-1, 6), *(hits[key].reshape(rays[..., 0].size, -1) for key in hits))
         return hits
 
