@@ -32,9 +32,12 @@ CORRECTION_M = 0.005
 """Greatest shift by which ICP may still improve a frame; 0 in all correct rollouts that were tried."""
 CORRECTION_DEG = 0.2
 """Greatest rotation by which it may."""
+SETTLED_SHARE = 0.85
+"""Single frames that agree less than their limit, but so much, are right where ICP leaves them: in correct rollouts of
+160x120, where leaves and legs lie between the pixels, views had 0.89 to 0.98. No pose that is off by 2 cm or half a
+degree was left so in the rollouts that were tried, and a shift along what the surfaces do not fix changes no depth."""
 PROVED_SHARE = 0.95
-"""Single frames that agree less than their limit, but so much, are right where ICP, with all six directions fixed,
-leaves them: in one of 106 correct rollouts (160x120, where thin things lie between the pixels) a view had 0.977."""
+"""What also agrees so much, and has surfaces that fix all six directions, no other check calls wrong."""
 _LEAST_GAIN_M = 0.0005
 _REGISTERED = 100
 _NAMED = 5
@@ -54,7 +57,7 @@ class Geometry:
     bad: NDArray[np.bool_]
     """`(n,)` frames that disagree."""
     proved: NDArray[np.bool_]
-    """`(n,)` frames that agree, or nearly so, that ICP leaves where they are; surfaces fix all their six directions."""
+    """`(n,)` frames whose poses are right: `PROVED_SHARE`."""
     diagnosis: Diagnosis | None
     """What explains the disagreement, where that is known."""
 
@@ -98,9 +101,9 @@ def check_geometry(
     agreement = comparison.full(given)
     bad = bad_frames(agreement, given.kept)
     corrections = _corrections(comparison, given, agreement, bad)
-    proved = _proved(agreement, given, corrections)
+    proved = _left_by_icp(agreement, given, corrections, share=PROVED_SHARE, directions=6)
     if bad.sum() <= _FEW:
-        bad &= ~proved
+        bad &= ~_left_by_icp(agreement, given, corrections, share=SETTLED_SHARE, directions=1)
     passed = not (agreement.share(given.kept) < AGREEING_SHARE or bad.any())
     diagnosis = None if passed or not explain else _diagnose(comparison, given, rollout, bad, corrections)
     hidden = _hidden_mistakes(comparison, given) if passed and explain else []
@@ -134,12 +137,15 @@ def _diagnose(
     return found
 
 
-def _proved(agreement: Agreement, given: Cameras, corrections: dict[int, Correction | None]) -> NDArray[np.bool_]:
-    share, compared = agreement.per_frame(given.kept)
-    fixed = np.zeros(len(given.poses), bool)
+def _left_by_icp(
+    agreement: Agreement, given: Cameras, corrections: dict[int, Correction | None], *, share: float, directions: int
+) -> NDArray[np.bool_]:
+    """`(n,)` frames that ICP, with so many directions fixed, does not move, and of which such a share agrees."""
+    agreeing, compared = agreement.per_frame(given.kept)
+    left = np.zeros(len(given.poses), bool)
     for frame, correction in corrections.items():
-        fixed[frame] = correction is not None and correction.fixed_directions == 6 and _small(correction)
-    return fixed & (compared >= LEAST_COMPARED) & (share >= PROVED_SHARE)
+        left[frame] = correction is not None and correction.fixed_directions >= directions and _small(correction)
+    return left & (compared >= LEAST_COMPARED) & (agreeing >= share)
 
 
 def _small(correction: Correction) -> bool:
@@ -197,7 +203,7 @@ def _agreement_verdict(
     text = (
         f"{100 * agreement.share():.2f} % of {agreement.compared()} points seen twice agree within 2 cm "
         f"(limit {100 * AGREEING_SHARE} %); worst is {name_of(given, worst)} with {100 * share[worst]:.1f} % "
-        f"(limit {100 * AGREEING_SHARE_OF_FRAME:.0f} %, or {100 * PROVED_SHARE:.0f} % where ICP finds no better place)"
+        f"(limit {100 * AGREEING_SHARE_OF_FRAME:.0f} %, or {100 * SETTLED_SHARE:.0f} % where ICP finds no better place)"
     )
     if hidden:
         text += f"; these views cannot show {', '.join(hidden)}"

@@ -52,7 +52,8 @@ def best_focal_factor(stacked: Stacked, poses: Float, intrinsics: Intrinsics) ->
     best = int(np.argmin([cost(factor) for factor in coarse]))
     bounds = coarse[max(best - 1, 0)], coarse[min(best + 1, len(coarse) - 1)]
     found: Any = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-4})
-    gains = medians(1.0) - medians(found.x)
+    # Where nothing turns, a longer focal length fits as well, and makes less of the same pixels of noise.
+    gains = medians(1.0) / max(1.0, found.x) - medians(found.x)
     # A paired test: a few pairs that gain much are no evidence where the others gain nothing.
     noise = float(gains.std() / np.sqrt(len(gains)))
     return float(found.x) if gains.mean() >= max(FOCAL_GAIN_PX, FOCAL_GAIN_NOISES * noise) else 1.0
