@@ -258,7 +258,7 @@ def test_wide_coverage_counts_at_least_what_is_visible():
     ("change", "words"),
     [
         ({"reward": "propsed"}, "unknown reward 'propsed'.*did you mean 'proposed'"),
-        ({"budget": 0}, "budget: expected a whole number from 1 to 100,000, got 0"),
+        ({"budget": 0}, "budget: expected a whole number from 1 to 32,767, got 0"),
         ({"hfov_deg": 190}, "hfov_deg"),
         ({"pitch_limit_deg": 90}, "pitch_limit_deg"),
         ({"coverage_mode": "visble"}, "unknown coverage_mode 'visble'.*did you mean 'visible'"),
