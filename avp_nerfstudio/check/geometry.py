@@ -171,7 +171,12 @@ def _correction(
     comparison: Comparison, given: Cameras, frame: int, partners: NDArray[np.int64], *, far: bool
 ) -> Correction | None:
     """ICP's correction where it makes the frame agree better; else none, whatever ICP says."""
-    correction = register(comparison.maps, given, frame, partners, far=far) if len(partners) else None
+    if not len(partners):
+        return None
+    # What is far off for another reason than its pose, as leaves between the pixels, can still be held to what is near.
+    correction = register(comparison.maps, given, frame, partners, far=far)
+    if correction is None and far:
+        correction = register(comparison.maps, given, frame, partners, far=False)
     if correction is None:
         return None
     poses = given.poses.copy()

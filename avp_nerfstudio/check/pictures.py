@@ -27,6 +27,8 @@ Mask = NDArray[np.bool_]
 # Percent of a frame's matches that do not fit, median over the frames. In 24 correct rollouts of all policies and
 # sizes 2 to 17 % did not: false ones, and features of blurred walls. Wrong conventions leave 60 to 100 %.
 MISFIT_LIMIT = 0.4
+# Poses that the depth proves right, and relative poses that fit, from which on it is the matches that are false.
+MIN_PROVED, FITTING_SHARE = 5, 0.9
 # Rotations 0.00 to 0.08 deg off (median of the pairs; 0.21 at 320x240), directions 0.15 to 1.6 deg, 5.9 deg in that
 # random walk. Single pairs can be far off where a wall fills both pictures, so a frame's own median only shows gross
 # faults: 0.3 to 2.9 deg.
@@ -94,7 +96,8 @@ def judge(
     proved = np.zeros(len(poses), bool) if proved is None else proved
     stacked = stack_matches(matches)
     factor = best_focal_factor(stacked, poses, intrinsics)
-    misfit = 1 - float(np.nanmedian(frame_shares(stacked, poses, intrinsics)))
+    fit = frame_shares(stacked, poses, intrinsics)
+    misfit = 1 - float(np.nanmedian(fit))
     off = frames_off(stacked, poses, intrinsics, proved=proved) if misfit <= MISFIT_LIMIT else {}
     cause = likely_cause(stacked, poses, intrinsics, focal_factor=factor, off=off, frames=matches.frames, proved=proved)
     error_px = float(np.median(ray_errors(stacked, poses, intrinsics)))
@@ -102,8 +105,16 @@ def judge(
     shares = pair_shares(stacked, poses, intrinsics)
     pairs = zip(estimated.first.tolist(), estimated.second.tolist(), strict=True)
     fitting = np.array([shares[pair] >= 1 - MISFIT_LIMIT for pair in pairs], bool)
+    right = fit[proved & np.isfinite(fit)]
+    false = misfit > MISFIT_LIMIT and len(right) >= MIN_PROVED and 1 - np.median(right) > MISFIT_LIMIT
+    if false and len(fitting) >= MIN_PAIRS and fitting.mean() >= FITTING_SHARE:
+        reprojection = _false_matches(matches, known, misfit=misfit, right=len(right), fitting=fitting)
+    else:
+        reprojection = _judge_reprojection(
+            matches, known, misfit=misfit, error_px=error_px, off=off, factor=factor, cause=cause
+        )
     return [
-        _judge_reprojection(matches, known, misfit=misfit, error_px=error_px, off=off, factor=factor, cause=cause),
+        reprojection,
         _judge_relative(matches, estimated, poses, intrinsics, fitting=fitting, cause=cause),
     ]
 
@@ -164,6 +175,22 @@ def _unjudged(name: str, matches: Matches, known: int) -> Verdict:
         f"gave {len(matches.pairs)} matching pairs, enough for {known} frames"
     )
     return Verdict(name, True, text, figures)
+
+
+def _false_matches(matches: Matches, known: int, *, misfit: float, right: int, fitting: Mask) -> Verdict:
+    """Patterns that repeat match falsely in whole pairs: where poses are right for sure, that is no fault of them."""
+    figures = {
+        "misfit_percent": 100 * misfit,
+        "judged_frames": 0.0,
+        "frames": float(len(matches.names)),
+        "pairs": float(len(matches.pairs)),
+    }
+    text = (
+        f"could not be judged: {100 * misfit:.0f} % of the matches of {known} frames are off by more than {FIT_PX} px, "
+        f"but also at {right} poses that the depth proves right, and {int(fitting.sum())} of {len(fitting)} relative "
+        "poses fit: the matches are false, as of patterns that repeat"
+    )
+    return Verdict("reprojection", True, text, figures)
 
 
 def _judge_reprojection(

@@ -25,6 +25,8 @@ SPREAD_OF_PAIRS = 0.13
 FALSE_ALARMS = 0.001
 # What the depth proves right, the pictures contradict only when they are those of another place.
 PROVED_GAIN = 0.5
+# And only with so many others: one or two pairs of a repeating pattern can be false as a whole.
+PROVED_PAIRS = 4
 _SCALE_PX = 0.5
 
 
@@ -118,7 +120,8 @@ def frames_off(
         stacked: the matches.
         poses: `(n, 4, 4)` camera_to_world, habitat axes, of the n pictures.
         intrinsics: of all pictures.
-        proved: `(n,)` poses that something else proves right: only a gain of `PROVED_GAIN` speaks against these.
+        proved: `(n,)` poses that something else proves right: only a gain of `PROVED_GAIN` in
+            `PROVED_PAIRS` pairs or more speaks against these.
 
     Returns:
         By picture.
@@ -128,6 +131,8 @@ def frames_off(
     tested = int((pairs > 0).sum())
     found = {}
     for picture in np.flatnonzero(pairs):
+        if proved[picture] and pairs[picture] < PROVED_PAIRS:
+            continue
         limit = max(gain_limit(int(pairs[picture]), tested), PROVED_GAIN * proved[picture])
         # No gain is greater than what does not fit yet.
         if 1 - shares[picture] > limit:
