@@ -15,6 +15,7 @@ from avp_nerfstudio.check.pictures_causes import best_focal_factor
 from avp_nerfstudio.check.pictures_frames import gain_limit
 from avp_nerfstudio.check.pictures_matching import match_pictures
 from avp_nerfstudio.check.pictures_rays import Stacked
+from avp_nerfstudio.check.pictures_relative import estimate_relative_poses
 
 POSES = walk_poses()
 ALL = np.ones(len(POSES), bool)
@@ -127,3 +128,43 @@ def test_a_focal_length_that_suits_all_pairs_is_found(factor):
 def test_one_pair_beside_many_that_stand_still_is_no_evidence_on_the_focal_length():
     stacked, poses = turned_pairs([0.0] * 20 + [1.2])
     assert best_focal_factor(stacked, poses, CAMERA) == 1.0
+
+
+def test_noise_is_no_evidence_on_the_focal_length_of_pictures_that_do_not_turn():
+    """A longer focal length makes less of the same noise."""
+    stacked, poses = turned_pairs([0.0] * 20)
+    noise = np.random.default_rng(1).normal(0, 0.3, stacked.pixels.shape)
+    walked = poses.copy()
+    walked[20:, :3, 3] -= [0, 0, 0.25]
+    assert best_focal_factor(replace(stacked, pixels=stacked.pixels + noise), walked, CAMERA) == 1.0
+
+
+def falsified(matches, pairs):
+    """Matches in which these pairs join features at random."""
+    rng, found = np.random.default_rng(0), []
+    for number, pair in enumerate(matches.pairs):
+        rows = pair.features.copy()
+        if number in pairs:
+            rows[:, 1] = rng.permutation(rows[:, 1])
+        found.append(replace(pair, features=rows))
+    return replace(matches, pairs=found)
+
+
+def test_matches_that_fit_no_proved_pose_are_false_and_no_fault_of_the_poses(matches):
+    order = np.random.default_rng(0).permutation(len(matches.pairs))
+    false = falsified(matches, set(order[: int(0.7 * len(order))].tolist()))
+    estimated = estimate_relative_poses(replace(matches, pairs=[matches.pairs[k] for k in order[-12:]]), CAMERA)
+    blind, proved = (judge(false, POSES, CAMERA, proved=p, estimated=estimated)[0] for p in (None, ALL))
+    assert not blind.passed
+    assert proved.passed
+    assert "could not be judged" in proved.text
+    shifted = np.roll(POSES, 1, axis=0)
+    assert not judge(matches, shifted, CAMERA, proved=ALL)[0].passed
+
+
+def test_two_false_pairs_say_nothing_against_a_proved_pose(matches):
+    own = [k for k, pair in enumerate(matches.pairs) if 6 in (pair.first, pair.second)]
+    kept = [k for k in range(len(matches.pairs)) if k not in own[2:]]
+    few = replace(matches, pairs=[matches.pairs[k] for k in kept])
+    assert "frame 6" in judge(few, moved(6, 0.08), CAMERA)[0].text
+    assert judge(few, moved(6, 0.08), CAMERA, proved=ALL)[0].passed
