@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
+from avp_habitat.progress import progress
 from avp_habitat.rollout import Rollout
 from avp_habitat.scenes.loader import Scene, load_scene
 from avp_habitat.scenes.location import HELP as SCENES
@@ -82,7 +81,7 @@ def _scene_of(rollout: Rollout, mesh: str, up: str | None) -> Scene:
 
 def _with_bar(check_geometry: Any, rollout: Rollout, scene: Scene | None) -> Any:
     total = len(rollout.frames) + len(rollout.heldout)
-    with tqdm(total=total, unit="view", desc="comparing depth", disable=None) as bar:
+    with progress(total=total, unit="view", desc="comparing depth") as bar:
         return check_geometry(rollout, scene, progress=bar.update)
 
 
