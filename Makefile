@@ -1,6 +1,6 @@
 # Every target sets up what it needs first; a second run starts in seconds.
 BIN := .venv/bin
-SOURCES := avp_habitat avp_sb3 avp_nerfstudio experiment examples benchmarks scripts tests
+SOURCES := avp_habitat avp_sb3 avp_nerfstudio avp_experiment examples benchmarks scripts tests
 # One process of tests per core; the tests of a file stay together, because they share what they have made.
 PARALLEL := --numprocesses auto --dist loadfile
 

@@ -12,28 +12,31 @@ from typing import Any
 from tqdm import tqdm
 
 from avp_habitat import command
-from avp_habitat.env import AVPEnv
-from avp_habitat.episode import steps_of
+from avp_habitat.command import progress
 from avp_habitat.errors import RolloutError, UsageError
+from avp_habitat.files import check_writable
 from avp_habitat.gpu import nerfacto_line
-from avp_habitat.heldout import VIEWS
-from avp_habitat.new_folder import check_writable
-from avp_habitat.policies import POLICY_NAMES, TRUSTED, Policy, check_policy, described
-from avp_habitat.policy_env import make_policy_env
+from avp_habitat.policies.registry import (
+    POLICY_NAMES,
+    TRUSTED,
+    Policy,
+    check_policy,
+    described,
+    make_policy_env,
+    steps_of,
+)
 from avp_habitat.poses import Intrinsics
-from avp_habitat.progress import progress
-from avp_habitat.rewards import REWARD_NAMES
-from avp_habitat.rollout_capture import capture_heldout, capture_step, publish_rollout
-from avp_habitat.rollout_writer import RolloutWriter
+from avp_habitat.rollout.capture import VIEWS, capture_heldout, capture_step, publish_rollout
+from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.settings import TaskSettings
-from avp_habitat.simulators import SimulatorChoice, open_simulator
-from avp_habitat.simulators.options import add_simulator_options, simulator_choice
-from avp_habitat.tracking.addresses import TrackingError, address_of, shown
-from avp_habitat.tracking.early import open_store
+from avp_habitat.simulators.registry import SimulatorChoice, add_simulator_options, open_simulator, simulator_choice
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.rewards import REWARD_NAMES
+from avp_habitat.task.settings import TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
-from avp_habitat.tracking.looking import about_run
+from avp_habitat.tracking.names import open_store
 from avp_habitat.tracking.rollout_run import command_for, rollout_run
+from avp_habitat.tracking.stores import TrackingError, about_run, address_of, shown
 
 
 @dataclass(frozen=True)

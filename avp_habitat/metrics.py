@@ -1,9 +1,9 @@
-"""Figures that describe a whole episode or many of them: coverage, ANND, EI, CpV, path length."""
+"""Figures of episodes and rollouts, what their names mean, and means with their confidence intervals."""
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from avp_habitat.visibility import ALIKE_DEG, ALIKE_DISTANCE, PARALLAX_DEG
+from avp_habitat.sight.visibility import ALIKE_DEG, ALIKE_DISTANCE, PARALLAX_DEG
 
 Float = NDArray[np.floating]
 
@@ -96,3 +96,27 @@ def path_length(start: Float, positions: Float) -> float:
     """Length in metres of the way from `(3,)` start through `(n, 3)` positions."""
     points = np.concatenate([np.asarray(start)[None], np.asarray(positions).reshape(-1, 3)])
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+CONFIDENCE = 0.95
+
+
+def mean_and_half_width(values: ArrayLike, *, confidence: float = CONFIDENCE) -> tuple[NDArray, NDArray]:
+    """Mean over episodes or runs, and half the width of its confidence interval (Student's t, n - 1 degrees).
+
+    Args:
+        values: `(n, ...)` a figure of each of n episodes, n at least 1.
+        confidence: within (0, 1).
+
+    Returns:
+        `(...)` each; the half width is nan for one episode, of whose spread nothing is known.
+    """
+    from scipy import stats
+
+    values = np.asarray(values, dtype=np.float64)
+    n = len(values)
+    mean = values.mean(axis=0)
+    if n < 2:
+        return mean, np.full_like(mean, np.nan)
+    error = values.std(axis=0, ddof=1) / np.sqrt(n)
+    return mean, stats.t.ppf((1 + confidence) / 2, n - 1) * error

@@ -1,7 +1,9 @@
-"""What trackers of both halves write down of a run: the commit, and settings under flat names."""
+"""Versions of Python and of installed packages, for whoever has to say what made a result."""
 
+import platform
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from importlib import metadata
 from typing import Any
 
 
@@ -26,3 +28,31 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             leaves[f"{prefix}{key}"] = value
     return leaves
+
+
+PACKAGES = (
+    "avp-suite",
+    "stable-baselines3",
+    "nerfstudio",
+    "torch",
+    "gymnasium",
+    "numpy",
+    "open3d",
+    "mlflow",
+    "rerun-sdk",
+)
+"""The suite, and what its results depend on most."""
+
+
+def installed_versions(packages: Iterable[str]) -> dict[str, str]:
+    """Version by name, of `python` first and then of those of the packages that are installed."""
+    found = {"python": platform.python_version()}
+    return found | {package: version for package in packages if (version := version_of(package)) is not None}
+
+
+def version_of(distribution: str) -> str | None:
+    """Installed version of a distribution; None when it is not installed."""
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None

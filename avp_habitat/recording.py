@@ -5,17 +5,63 @@ import sys
 import weakref
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, SupportsFloat
+from typing import Any, NoReturn, SupportsFloat
 
 import gymnasium
 
-from avp_habitat.env import AVPEnv
 from avp_habitat.errors import AVPError, UsageError
-from avp_habitat.heldout import VIEWS
 from avp_habitat.poses import Intrinsics
-from avp_habitat.rollout_capture import capture_heldout, capture_step, publish_rollout
-from avp_habitat.rollout_writer import RolloutWriter
-from avp_habitat.worker_env import UnopenedEnv, in_sb3_worker
+from avp_habitat.rollout.capture import VIEWS, capture_heldout, capture_step, publish_rollout
+from avp_habitat.rollout.writing import RolloutWriter
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.observations import action_space, observation_space
+from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
+
+_WORKERS = "stable_baselines3.common.vec_env.subproc_vec_env"
+
+
+def in_sb3_worker() -> bool:
+    """Whether a worker of `SubprocVecEnv` is among the callers."""
+    frame = sys._getframe()
+    while frame is not None:
+        if frame.f_code.co_name == "_worker" and frame.f_globals.get("__name__") == _WORKERS:
+            return True
+        frame = frame.f_back
+    return False
+
+
+class UnopenedEnv(gymnasium.Env):
+    """An environment without a scene, which can only tell why."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 - gymnasium's own declaration
+
+    def __init__(self, error: AVPError, **options: Any) -> None:
+        """Keep the error.
+
+        Args:
+            error: that opening the scene ended in.
+            **options: of the `AVPEnv` that could not be made.
+        """
+        self.failure = (type(error).__name__, str(error))
+        """Name of the error's class, and its text."""
+        self.render_mode = options.get("render_mode")
+        settings = options.get("settings") or TaskSettings()
+        kind = options.get("observation", settings.observation)
+        self.observation_space = observation_space(kind if kind in OBSERVATION_NAMES else OBSERVATION_NAMES[0])
+        self.action_space = action_space()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> NoReturn:
+        """End the process.
+
+        Raises:
+            SystemExit: always, with the error's text, which Python prints as one line.
+        """
+        raise SystemExit(f"error: {self.failure[1]}")
+
+    def step(self, action: Any) -> NoReturn:
+        """As `reset`."""
+        self.reset()
+
 
 _PICTURE = (640, 480)
 

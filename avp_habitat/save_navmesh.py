@@ -10,7 +10,7 @@ from pathlib import Path
 from avp_habitat import command
 from avp_habitat.errors import SceneError, UsageError
 from avp_habitat.scenes.location import HELP
-from avp_habitat.simulators.options import add_up_option
+from avp_habitat.simulators.registry import add_up_option
 
 
 def save_navmesh(scene: str | Path, out: Path, *, gpu: int | None = None, up: str | None = None) -> float:

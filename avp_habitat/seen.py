@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from avp_habitat import command
+from avp_habitat.command import progress
 from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.metrics import TERMS, explained
-from avp_habitat.progress import progress
-from avp_habitat.rollout import name_of, read_rollout
-from avp_habitat.rollout_visibility import visibility_of
-from avp_habitat.visibility import Visibility
+from avp_habitat.rollout.format import name_of, read_rollout
+from avp_habitat.rollout.seen import visibility_of
+from avp_habitat.sight.visibility import Visibility
 
 _COLUMNS = {
     "rollout": "rollout",

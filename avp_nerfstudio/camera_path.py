@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from avp_habitat import command
 from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.poses import camera_to_world, y_up_to_z_up, yaw_and_pitch
-from avp_habitat.rollout import read_rollout
+from avp_habitat.rollout.format import read_rollout
 
 Float = NDArray[np.floating]
 

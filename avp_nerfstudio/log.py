@@ -15,17 +15,16 @@ from tqdm import tqdm
 from avp_habitat import command
 from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.metrics import TERMS, explained
-from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, address_of
-from avp_habitat.tracking.early import open_store
 from avp_habitat.tracking.experiments import DEFAULT_HELP
-from avp_habitat.tracking.looking import about_run
-from avp_nerfstudio.tracking_mlflow import open_again
-from avp_nerfstudio.trained_run import TrainedRun, config_path, open_trained, read_config
+from avp_habitat.tracking.names import open_store
+from avp_habitat.tracking.stores import DEFAULT_ADDRESS, about_run, address_of
+from avp_nerfstudio.tracking.mlflow import open_again
+from avp_nerfstudio.tracking.trained_run import TrainedRun, config_path, open_trained, read_config
 
 if TYPE_CHECKING:
     from avp_habitat.tracking.run import TrackedRun as MLflowRun
-    from avp_nerfstudio.heldout_views import HeldoutView
-    from avp_nerfstudio.tracking_rerun import ReconstructionRecording
+    from avp_nerfstudio.data.heldout import HeldoutView
+    from avp_nerfstudio.tracking.rerun import ReconstructionRecording
 
 TABLE = "heldout.json"
 _ARTIFACTS = "heldout"
@@ -94,7 +93,7 @@ def _render(
     request: Request, trained: TrainedRun, recording: "ReconstructionRecording | None"
 ) -> tuple[list[dict[str, Any]], list[Path]]:
     """The table's rows, and the pictures' files."""
-    from avp_nerfstudio.heldout_views import heldout_count, render_views
+    from avp_nerfstudio.data.heldout import heldout_count, render_views
 
     count = heldout_count(trained.pipeline)
     if not count:
@@ -114,8 +113,8 @@ def _render(
 
 
 def _write_picture(folder: Path, view: "HeldoutView") -> Path:
-    from avp_habitat.images import write_rgb
-    from avp_nerfstudio.heldout_pictures import triptych
+    from avp_habitat.rollout.images import write_rgb
+    from avp_nerfstudio.data.heldout import triptych
 
     path = folder / f"view_{view.index:05d}.png"
     write_rgb(path, triptych(view))
@@ -123,7 +122,7 @@ def _write_picture(folder: Path, view: "HeldoutView") -> Path:
 
 
 def _write_table(path: Path, request: Request, trained: TrainedRun, rows: Sequence[dict[str, Any]]) -> dict[str, float]:
-    from avp_nerfstudio.heldout_views import mean_scores
+    from avp_nerfstudio.data.heldout import mean_scores
 
     scores = mean_scores([{key: row[key] for key in row if key not in ("view", "name")} for row in rows])
     seconds = scores.pop("seconds")
@@ -143,8 +142,8 @@ def _track(
     request: Request, address: str, trained: TrainedRun, scores: dict[str, float], files: list[Path]
 ) -> tuple[str, bool]:
     """The run's id, and whether MLflow has all of it."""
-    from avp_nerfstudio.tracking_events import read_events
-    from avp_nerfstudio.tracking_facts import facts_of
+    from avp_nerfstudio.tracking.facts import facts_of
+    from avp_nerfstudio.tracking.logger import read_events
 
     folder = request.config.parent
     facts = facts_of(trained.config)
@@ -189,8 +188,7 @@ def _recording(path: Path | None, trained: TrainedRun) -> "Iterator[Reconstructi
     if path is None:
         yield None
         return
-    from avp_nerfstudio.tracking import start_recording
-    from avp_nerfstudio.tracking_events import read_events
+    from avp_nerfstudio.tracking.logger import read_events, start_recording
 
     recording = start_recording(path, trained.pipeline)
     try:

@@ -5,13 +5,57 @@ that it cannot take the user's other methods with it. They are made when asked f
 dataparser while the modules that the method needs are still half imported.
 """
 
+import atexit
 import functools
 import logging
+import os
+import shutil
 import sys
+import tempfile
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
+
+
+@functools.cache
+def offer_ffmpeg() -> None:
+    """Let nerfstudio's own check for ffmpeg find the one of imageio-ffmpeg, where there is no other.
+
+    nerfstudio 1.1.5 looks for a program named `ffmpeg` on the PATH and ends `ns-render` when there is none, although
+    pip cannot install such a program. Nothing happens before that check runs.
+    """
+    from nerfstudio.utils import install_checks
+
+    check = install_checks.check_ffmpeg_installed
+
+    @functools.wraps(check)
+    def check_ffmpeg_installed() -> None:
+        put_ffmpeg_on_path()
+        check()
+
+    install_checks.check_ffmpeg_installed = check_ffmpeg_installed
+
+
+def put_ffmpeg_on_path() -> None:
+    """Append a folder with imageio-ffmpeg's program, under the name `ffmpeg`, to this process's PATH.
+
+    An ffmpeg that is on the PATH already stays the one in use. The folder is removed when the process ends.
+    """
+    if shutil.which("ffmpeg") is not None:
+        return
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        program = Path(get_ffmpeg_exe()).resolve()
+    except (ImportError, RuntimeError):
+        return  # nerfstudio's own check comes next, and says that there is no ffmpeg and where to get it
+    folder = Path(tempfile.mkdtemp(prefix="avp-ffmpeg-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    (folder / "ffmpeg").symlink_to(program)
+    os.environ["PATH"] = os.pathsep.join([*filter(None, [os.environ.get("PATH")]), str(folder)])
+
 
 _LOGGER = logging.getLogger(__name__)
 # What nerfstudio 1.1.5 makes the torch of today say at every command, none of which its users can change.
@@ -39,7 +83,7 @@ class Unavailable:
 def _data() -> Any:
     from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
-    from avp_nerfstudio.dataparser import AVPDataParserConfig
+    from avp_nerfstudio.data.dataparser import AVPDataParserConfig
 
     return DataParserSpecification(
         config=AVPDataParserConfig(), description="A rollout of the AVP suite: metric poses, held-out views for eval."
@@ -47,20 +91,20 @@ def _data() -> Any:
 
 
 def _nerfacto() -> Any:
-    from avp_nerfstudio.method import avp_nerfacto
+    from avp_nerfstudio.method.config import avp_nerfacto
 
     return avp_nerfacto()
 
 
 def _checkpoints() -> None:
-    from avp_nerfstudio.checkpoints import allow_checkpoints, refuse_in_one_line
+    from avp_nerfstudio.method.checkpoints import allow_checkpoints, refuse_in_one_line
 
     allow_checkpoints()
     refuse_in_one_line()
 
 
 def _videos() -> None:
-    from avp_nerfstudio.ffmpeg import offer_ffmpeg
+    pass
 
     offer_ffmpeg()
 

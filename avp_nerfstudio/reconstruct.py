@@ -1,7 +1,7 @@
 """`python -m avp_nerfstudio.reconstruct`: train on one rollout and score its held-out views, in one process.
 
 Importing nerfstudio takes seconds; a program with many reconstructions pays for it once by calling `reconstruct`, or
-`main`, in forks of a process that has imported `avp_nerfstudio.reconstruct_imports`.
+`main`, in forks of a process that has imported `avp_nerfstudio.method.preload`.
 """
 
 import argparse
@@ -15,11 +15,11 @@ from typing import Any
 
 from avp_habitat import command
 from avp_habitat.errors import RolloutError, UsageError, unknown_name
+from avp_habitat.files import NewFolder
 from avp_habitat.metrics import explained
-from avp_habitat.new_folder import NewFolder
-from avp_habitat.rollout import Rollout, read_rollout
-from avp_habitat.tracking.addresses import DEFAULT_ADDRESS, address_of
-from avp_habitat.tracking.early import open_store
+from avp_habitat.rollout.format import Rollout, read_rollout
+from avp_habitat.tracking.names import open_store
+from avp_habitat.tracking.stores import DEFAULT_ADDRESS, address_of
 
 METHODS = ("avp-nerfacto", "nerfacto")
 SEED = 42
@@ -71,7 +71,7 @@ def reconstruct(request: Request) -> dict[str, Any]:
         with warnings.catch_warnings():
             # nerfstudio and what it imports warn their developers, at length.
             warnings.simplefilter("ignore")
-            from avp_nerfstudio.reconstruct_process import process
+            from avp_nerfstudio.method.reconstruction import process
 
             found = process(request, rollout, folder, started=started)
         folder.publish()

@@ -4,13 +4,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from avp_sb3.evaluation import PolicyResult, evaluate_policy
-    from avp_sb3.evaluation_callback import EvaluationCallback
-    from avp_sb3.metrics_callback import MetricsCallback
-    from avp_sb3.mlflow_callback import MLflowCallback
-    from avp_sb3.rerun_callback import RerunCallback
-    from avp_sb3.subproc import AVPSubprocVecEnv
-    from avp_sb3.vec_env import AVPVecEnv
+    from avp_sb3.callbacks.evaluation import EvaluationCallback
+    from avp_sb3.callbacks.metrics import MetricsCallback
+    from avp_sb3.callbacks.mlflow import MLflowCallback
+    from avp_sb3.callbacks.rerun import RerunCallback
+    from avp_sb3.evaluation.policy import PolicyResult, evaluate_policy
+    from avp_sb3.vec_env.batched import AVPVecEnv
+    from avp_sb3.vec_env.subproc import AVPSubprocVecEnv
 
 __all__ = [
     "AVPSubprocVecEnv",
@@ -24,14 +24,14 @@ __all__ = [
 ]
 
 _HOME = {
-    "AVPSubprocVecEnv": "avp_sb3.subproc",
-    "AVPVecEnv": "avp_sb3.vec_env",
-    "EvaluationCallback": "avp_sb3.evaluation_callback",
-    "MetricsCallback": "avp_sb3.metrics_callback",
-    "MLflowCallback": "avp_sb3.mlflow_callback",
-    "RerunCallback": "avp_sb3.rerun_callback",
-    "PolicyResult": "avp_sb3.evaluation",
-    "evaluate_policy": "avp_sb3.evaluation",
+    "AVPSubprocVecEnv": "avp_sb3.vec_env.subproc",
+    "AVPVecEnv": "avp_sb3.vec_env.batched",
+    "EvaluationCallback": "avp_sb3.callbacks.evaluation",
+    "MetricsCallback": "avp_sb3.callbacks.metrics",
+    "MLflowCallback": "avp_sb3.callbacks.mlflow",
+    "RerunCallback": "avp_sb3.callbacks.rerun",
+    "PolicyResult": "avp_sb3.evaluation.policy",
+    "evaluate_policy": "avp_sb3.evaluation.policy",
 }
 
 

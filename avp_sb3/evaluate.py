@@ -10,19 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from avp_habitat import command
-from avp_habitat.drawing import draw_trajectory
+from avp_habitat.command import progress
 from avp_habitat.errors import UsageError
-from avp_habitat.new_folder import check_writable
-from avp_habitat.policies import POLICY_NAMES, TRUSTED, check_policy, described
-from avp_habitat.progress import progress
-from avp_habitat.rewards import REWARD_NAMES
+from avp_habitat.files import check_writable
+from avp_habitat.policies.registry import POLICY_NAMES, TRUSTED, check_policy, described
+from avp_habitat.rollout.drawing import draw_trajectory
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.settings import OBSERVATION_NAMES, TaskSettings
-from avp_habitat.simulators.options import add_simulator_options, simulator_choice
+from avp_habitat.simulators.registry import add_simulator_options, simulator_choice
+from avp_habitat.task.rewards import REWARD_NAMES
+from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
+from avp_habitat.task.trajectory import Trajectory
 from avp_habitat.tracking.experiments import DEFAULT_HELP
-from avp_habitat.trajectory import Trajectory
-from avp_sb3.evaluation import Contestant, EpisodeResult, PolicyResult, run_episodes
-from avp_sb3.evaluation_report import LEGEND, ReportError, check_new, table, write_report
+from avp_sb3.evaluation.policy import Contestant, EpisodeResult, PolicyResult, run_episodes
+from avp_sb3.evaluation.report import LEGEND, ReportError, check_new, table, write_report
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -149,7 +149,7 @@ def _finish(
 
 def _track(results: Sequence[PolicyResult], about: dict[str, Any], options: argparse.Namespace, **more: Any) -> None:
     # Late: mlflow takes seconds to import.
-    from avp_sb3.evaluation_tracking import track_evaluation
+    from avp_sb3.evaluation.tracking import track_evaluation
 
     run, experiment, store = track_evaluation(results, about, options.out, experiment=options.experiment, **more)
     print(f"MLflow:  run {run} in experiment {experiment!r} at {store}")

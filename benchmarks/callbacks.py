@@ -27,8 +27,8 @@ from tqdm import tqdm
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
-from avp_habitat.rewards import check_reward
 from avp_habitat.scenes.location import HELP as SCENES
+from avp_habitat.task.rewards import check_reward
 from avp_sb3.presets import TABLE_4
 
 _BUFFER = TABLE_4.n_envs * TABLE_4.n_steps
@@ -92,8 +92,8 @@ class _Bench:
         import ppo
         import torch
 
-        from avp_habitat.settings import TaskSettings
-        from avp_habitat.simulators import make_simulator
+        from avp_habitat.simulators.registry import make_simulator
+        from avp_habitat.task.settings import TaskSettings
 
         torch.set_num_threads(1)
         self.options = options
@@ -143,9 +143,8 @@ class _Bench:
 
     def first_evaluation(self) -> dict[str, Any]:
         """CPU seconds of the default evaluation: opening its scene, the first time in it, and later ones."""
-        from avp_sb3.evaluation_batch import run_batch
-        from avp_sb3.evaluation_callback import DEFAULT_EPISODES, DEFAULT_EVERY, DEFAULT_SCENES
-        from avp_sb3.fixed_starts import FixedStarts
+        from avp_sb3.callbacks.evaluation import DEFAULT_EPISODES, DEFAULT_EVERY, DEFAULT_SCENES
+        from avp_sb3.evaluation.batch import FixedStarts, run_batch
 
         model, seconds = self.model(self.options.seed), []
         start = time.process_time()

@@ -29,9 +29,9 @@ from avp_habitat import command
 from avp_habitat.collect import Request, collect
 from avp_habitat.errors import AVPError
 from avp_habitat.poses import Intrinsics
-from avp_habitat.rollout import frame_name, read_rollout
+from avp_habitat.rollout.format import frame_name, read_rollout
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.settings import TaskSettings
+from avp_habitat.task.settings import TaskSettings
 
 _REPEATS = 3
 _MEASURE = "--measure"
@@ -116,7 +116,7 @@ def _measure(folder: Path) -> dict[str, float]:
     # nerfstudio's modules import each other in circles: its cameras come first.
     from nerfstudio.cameras.cameras import Cameras
 
-    from avp_nerfstudio.dataparser import AVPDataParserConfig
+    from avp_nerfstudio.data.dataparser import AVPDataParserConfig
 
     # The first Cameras of a process make torch import sympy, which takes seconds and is not the parser's.
     Cameras(torch.eye(4)[None, :3], fx=1.0, fy=1.0, cx=1.0, cy=1.0, width=2, height=2)

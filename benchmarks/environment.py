@@ -23,12 +23,12 @@ from tqdm import tqdm
 
 from avp_habitat import command
 from avp_habitat.errors import UsageError
-from avp_habitat.lookup.disk import ENVIRONMENT as CACHE
-from avp_habitat.lookup.tables import scene_tables
 from avp_habitat.scenes.loader import load_scene
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.settings import ACTION_NAMES, TaskSettings
-from avp_sb3.vec_env import AVPVecEnv
+from avp_habitat.sight.rows import ENVIRONMENT as CACHE
+from avp_habitat.sight.tables import scene_tables
+from avp_habitat.task.settings import ACTION_NAMES, TaskSettings
+from avp_sb3.vec_env.batched import AVPVecEnv
 
 _ROUNDS = 3
 

@@ -13,9 +13,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
-from avp_habitat.env import AVPEnv
-from avp_habitat.settings import TaskSettings
 from avp_habitat.simulators.base import Simulator
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.settings import TaskSettings
 from avp_sb3 import AVPVecEnv, MetricsCallback, MLflowCallback, RerunCallback
 from avp_sb3.presets import TABLE_4
 

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
-from avp_habitat.rollout import Rollout, read_rollout
+from avp_habitat.rollout.format import Rollout, read_rollout
 
 
 @dataclass(frozen=True)

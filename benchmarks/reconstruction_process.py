@@ -131,7 +131,7 @@ def _config(way: str, data: Path, output: Path) -> Any:
     import torch
     from nerfstudio.configs.method_configs import all_methods
 
-    from avp_nerfstudio.dataparser import AVPDataParserConfig
+    from avp_nerfstudio.data.dataparser import AVPDataParserConfig
 
     method, change = WAYS[way]
     config = all_methods[method]
@@ -154,7 +154,7 @@ def _config(way: str, data: Path, output: Path) -> Any:
 def _train(config: Any, clock_of: Callable[[], Clock]) -> tuple[Any, Clock]:
     from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
-    from avp_nerfstudio.lpips import optional_lpips
+    from avp_nerfstudio.method.scores import optional_lpips
 
     config.set_timestamp()
     trainer = config.setup(local_rank=0, world_size=1)
@@ -173,10 +173,9 @@ def _train(config: Any, clock_of: Callable[[], Clock]) -> tuple[Any, Clock]:
 
 
 def _score(trainer: Any, pictures: Path, views: Sequence[int], every: int) -> list[dict[str, Any]]:
-    from avp_habitat.images import write_rgb
-    from avp_nerfstudio.hash_encoding import compile_hash_encodings
-    from avp_nerfstudio.heldout_pictures import to_8_bit
-    from avp_nerfstudio.heldout_views import render_views
+    from avp_habitat.rollout.images import write_rgb
+    from avp_nerfstudio.data.heldout import render_views, to_8_bit
+    from avp_nerfstudio.method.hash_encoding import compile_hash_encodings
 
     trainer.pipeline.eval()
     # The compiled encoding gives the same colours (a test holds it to that), several times as fast.

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from avp_habitat.errors import AVPError, UsageError
-from avp_habitat.versions import installed_versions
+from avp_habitat.provenance import installed_versions
 
 FORMAT_VERSION = 1
 """Of the JSON files; rises when a key changes its meaning."""

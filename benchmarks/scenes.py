@@ -25,16 +25,16 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from avp_habitat import command
-from avp_habitat.lookup.disk import ENVIRONMENT as CACHE
-from avp_habitat.lookup.lattice import TILE, Lattice
-from avp_habitat.lookup.tables import SceneTables, scene_tables
 from avp_habitat.scenes.export import export_glb
 from avp_habitat.scenes.loader import load_scene
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.scenes.mesh import TexturedMesh
-from avp_habitat.settings import ACTION_NAMES, TaskSettings
+from avp_habitat.sight.rows import ENVIRONMENT as CACHE
+from avp_habitat.sight.rows import TILE, Lattice
+from avp_habitat.sight.tables import SceneTables, scene_tables
 from avp_habitat.simulators.raycast import RaycastSimulator
-from avp_habitat.task import ViewpointTask
+from avp_habitat.task.settings import ACTION_NAMES, TaskSettings
+from avp_habitat.task.task import ViewpointTask
 
 _BUMP_M = 0.002
 _HALL_HEIGHT_M = 3.0

@@ -27,18 +27,18 @@ from PIL import Image
 from tqdm import tqdm
 
 from avp_habitat import command, poses
-from avp_habitat.baselines.frontier import FrontierPolicy
-from avp_habitat.env import AVPEnv
-from avp_habitat.intervals import mean_and_half_width
-from avp_habitat.observation import NAMES
-from avp_habitat.policies import check_policy
+from avp_habitat.metrics import mean_and_half_width
+from avp_habitat.policies.frontier import FrontierPolicy
+from avp_habitat.policies.registry import check_policy
 from avp_habitat.poses import Intrinsics
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.settings import ACTION_NAMES, MOVE_FORWARD, TaskSettings
-from avp_habitat.simulators import Simulator, make_simulator
 from avp_habitat.simulators.habitat import HabitatSimulator
 from avp_habitat.simulators.habitat.graphics import FIRST_DEVICE, choose_gpu, inspect_graphics
-from avp_sb3.evaluation import evaluate_policy
+from avp_habitat.simulators.registry import Simulator, make_simulator
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.observations import NAMES
+from avp_habitat.task.settings import ACTION_NAMES, MOVE_FORWARD, TaskSettings
+from avp_sb3.evaluation.policy import evaluate_policy
 
 CAMERA = Intrinsics.from_hfov(640, 480, hfov_deg=90.0)
 SENSOR_HEIGHT_M = 1.5

@@ -24,9 +24,9 @@ from tqdm import tqdm
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
-from avp_habitat.lookup.disk import ENVIRONMENT as CACHE
-from avp_habitat.rewards import check_reward
 from avp_habitat.scenes.location import HELP as SCENES
+from avp_habitat.sight.rows import ENVIRONMENT as CACHE
+from avp_habitat.task.rewards import check_reward
 from avp_sb3.presets import TABLE_4
 
 _BUFFER = TABLE_4.n_envs * TABLE_4.n_steps
@@ -75,9 +75,9 @@ def _trainings(options: argparse.Namespace, folder: Path, results: reporting.Res
     import ppo
     from rays import RecordingSimulator
 
-    from avp_habitat.lookup.tables import scene_tables
     from avp_habitat.scenes.loader import load_scene
-    from avp_habitat.settings import TaskSettings
+    from avp_habitat.sight.tables import scene_tables
+    from avp_habitat.task.settings import TaskSettings
 
     simulator = RecordingSimulator(load_scene(options.scene))
     start = time.perf_counter()

@@ -15,9 +15,9 @@ _LATE = (
     "mlflow.store.tracking.sqlalchemy_store",
     "open3d",
     "rerun",
-    "avp_habitat.drawing",
-    "avp_habitat.history",
-    "avp_habitat.lookup.senses",
+    "avp_habitat.rollout.drawing",
+    "avp_habitat.task.motion",
+    "avp_habitat.task.lookup",
     "avp_habitat.navigation.build",
     "avp_habitat.scenes.loader",
 )
@@ -41,7 +41,7 @@ def main(argv: Sequence[str]) -> None:
 
     _import_the_rest()
     imported, _ = memory()
-    from avp_habitat.simulators import make_simulator
+    from avp_habitat.simulators.registry import make_simulator
 
     with tempfile.TemporaryDirectory() as name:
         timing = ppo.train(

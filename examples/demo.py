@@ -22,7 +22,7 @@ from typing import Any
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.metrics import explained
-from avp_habitat.rollout import read_rollout
+from avp_habitat.rollout.format import read_rollout
 
 METHODS = ("heuristic", "random", "learned")
 NOT_COMPUTED = "not computed"
@@ -174,8 +174,8 @@ class Row:
 
 def read_row(method: str, rollout: Path, reconstruction: Reconstruction) -> tuple[Row, str | None]:
     """A method's figures from its rollout and ns-eval's file; and why LPIPS is missing, if it is."""
-    from avp_nerfstudio.scores import read_scores
-    from avp_nerfstudio.tracking_mlflow import remembered_id
+    from avp_nerfstudio.method.scores import read_scores
+    from avp_nerfstudio.tracking.mlflow import remembered_id
 
     meta = read_rollout(rollout).meta
     found = read_scores(reconstruction.scores)
@@ -214,9 +214,9 @@ def write_table(folder: Path, rows: Sequence[Row], settings: Settings) -> str:
 
 def track(demo: Demo, rows: Sequence[Row]) -> None:
     """Scores for the reconstructions' MLflow runs, which lie below those of their rollouts; then the comparison."""
-    from avp_habitat.tracking.addresses import connect
+    from avp_habitat.tracking.names import find_run
     from avp_habitat.tracking.opening import join_run
-    from avp_habitat.tracking.remote import find_run
+    from avp_habitat.tracking.stores import connect
 
     client = connect(_TRACKING_URI)
     for row in rows:
@@ -232,7 +232,7 @@ def track(demo: Demo, rows: Sequence[Row]) -> None:
 
 def record(demo: Demo, rollouts: Sequence[Path]) -> Path:
     """The rollouts side by side as one Rerun recording."""
-    from avp_sb3.rerun_recording import write_rollout_recording
+    from avp_sb3.rerun.recording import write_rollout_recording
 
     target = demo.folder / "rollouts.rrd"
     _remove(target)

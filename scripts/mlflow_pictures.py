@@ -16,7 +16,7 @@ from PIL import Image
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
-from avp_habitat.tracking.addresses import connect, shown
+from avp_habitat.tracking.stores import connect, shown
 from avp_habitat.tracking.view import EVALUATIONS, MODEL_TRAINING, TRAININGS, path_of
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def _make_runs(options: argparse.Namespace, store: str) -> None:
     for observation in ("numbers", "map"):
         model = options.work / f"{observation}.zip"
         words = ["--observation", observation, "--run-name", observation, "--steps", options.steps]
-        _once(model, store, "examples/train.py", *words, "--out", model)
+        _once(model, store, "-m", "avp_sb3.train", *words, "--out", model)
     _run(store, "-m", "avp_habitat.tracking.compare")
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from avp_habitat.heldout import heldout_poses
 from avp_habitat.poses import Intrinsics
-from avp_habitat.simulators import make_simulator
+from avp_habitat.rollout.capture import heldout_poses
+from avp_habitat.simulators.registry import make_simulator
 
 TILE = (480, 360)
 GAP = 4

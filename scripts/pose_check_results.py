@@ -29,15 +29,15 @@ from scipy.stats import beta
 from avp_habitat import collect, command
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.poses import Intrinsics
-from avp_habitat.rollout import Rollout
-from avp_habitat.settings import TaskSettings
-from avp_habitat.versions import installed_versions
+from avp_habitat.provenance import installed_versions
+from avp_habitat.rollout.format import Rollout
+from avp_habitat.task.settings import TaskSettings
 from avp_nerfstudio.check.depth_maps import DepthMaps, load_depth_maps
 from avp_nerfstudio.check.faults import FAULTS, MORE_FAULTS, SMALL_FAULTS, damaged, write_faulty
 from avp_nerfstudio.check.geometry import check_geometry
-from avp_nerfstudio.check.pictures import judge
-from avp_nerfstudio.check.pictures_matching import Matches, match_pictures
-from avp_nerfstudio.check.pictures_relative import RelativePoses, estimate_relative_poses
+from avp_nerfstudio.check.pictures.evidence import judge
+from avp_nerfstudio.check.pictures.matching import Matches, match_pictures
+from avp_nerfstudio.check.pictures.rays import RelativePoses, estimate_relative_poses
 from avp_nerfstudio.check.shape import check_format
 from avp_nerfstudio.check.verdict import Verdict
 

@@ -17,9 +17,9 @@ from tqdm import tqdm
 
 from avp_habitat import command
 from avp_habitat.provenance import git_commit
-from avp_habitat.rewards import RewardConstants
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.settings import TaskSettings
+from avp_habitat.task.rewards import RewardConstants
+from avp_habitat.task.settings import TaskSettings
 
 EXPERIMENT = "avp-reward-search"
 VIEWS_WEIGHT = 0.3

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
-from avp_sb3.evaluation_statistics import mean_and_half_width
+from avp_sb3.evaluation.policy import mean_and_half_width
 
 ROOT = Path(__file__).resolve().parent.parent
 BASELINES = ("heuristic", "random", "spin", "frontier", "greedy", "oracle")
@@ -92,7 +92,7 @@ class Trained:
         if self.marker.exists():
             return
         how = self.configuration
-        words = ["python", "examples/train.py", "--scene", *([scene] if how.rooms == "one" else rooms)]
+        words = ["python", "-m", "avp_sb3.train", "--scene", *([scene] if how.rooms == "one" else rooms)]
         words += ["--reward", how.reward, "--observation", how.observation, "--steps", str(how.steps)]
         words += ["--seed", str(self.seed), "--out", str(self.model), "--experiment", EXPERIMENT]
         words += ["--run-name", f"{how.name} (seed {self.seed})"]
@@ -142,7 +142,7 @@ def in_parallel(jobs: int, title: str, tasks: Sequence[Any]) -> None:
 
 def pooled(trainings: Sequence[Trained], work: Path, scene: str) -> Any:
     """The results of all seeds of a configuration on a scene, as one."""
-    from avp_sb3.evaluation_report import read_report
+    from avp_sb3.evaluation.report import read_report
 
     found = {part.policy: part for part in read_report(_report(work, trainings[0].configuration.reward, scene))}
     parts = [found[str(training.model)] for training in trainings]
@@ -219,7 +219,7 @@ def _history(client: Any, training: Trained, metric: str) -> tuple[list[int], li
 
 def write_results(options: argparse.Namespace, trainings: Sequence[Trained], argv: Sequence[str]) -> None:
     """Tables, JSON, and pictures in the results' folder."""
-    from avp_sb3.evaluation_report import read_report, table, write_report
+    from avp_sb3.evaluation.report import read_report, table, write_report
 
     about = {"command": shlex.join(["python", "scripts/training_results.py", *argv]), "seed": FIRST_SEED}
     out: Path = options.out

@@ -5,13 +5,12 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from experiment.cells import COLLECT, plan
-from experiment.configuration import Configuration, Scene
-from experiment.execute import environment
-from experiment.methods import chosen_methods
-from experiment.presets import PRESETS
-from experiment.runner import Runner
-from experiment.store import Store
+from avp_experiment.cells import COLLECT, plan
+from avp_experiment.configuration import Configuration, Scene, chosen_methods
+from avp_experiment.execute import environment
+from avp_experiment.presets import PRESETS
+from avp_experiment.runner import Runner
+from avp_experiment.store import Store
 
 
 def rollouts(root):
@@ -22,7 +21,7 @@ def rollouts(root):
 
 
 def run(root, cells, jobs=1):
-    runner = Runner(Store(root), jobs, environment(f"sqlite:///{root}/mlflow.db"), ("experiment.execute",))
+    runner = Runner(Store(root), jobs, environment(f"sqlite:///{root}/mlflow.db"), ("avp_experiment.execute",))
     runner.run(cells)
     return runner
 

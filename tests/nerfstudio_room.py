@@ -3,7 +3,7 @@
 import numpy as np
 
 from avp_habitat.poses import Intrinsics, camera_to_world, pixel_directions
-from avp_habitat.rollout_writer import RolloutWriter
+from avp_habitat.rollout.writing import RolloutWriter
 
 # Walls, floor and ceiling at unlike distances, so that no two axes can be swapped unseen.
 ROOM = np.array([[-1.5, 0.0, -2.5], [2.0, 2.4, 1.0]])

@@ -5,8 +5,8 @@ import dataclasses
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils import writer
 
-from avp_nerfstudio.config import trainer_config
-from avp_nerfstudio.trainer import AVPTrainerConfig
+from avp_nerfstudio.method.config import trainer_config
+from avp_nerfstudio.method.trainer import AVPTrainerConfig
 
 
 def tiny_config(room, folder, *, iterations=12, **options):

@@ -3,9 +3,9 @@
 import numpy as np
 
 from avp_habitat.poses import Intrinsics, camera_to_world, heading
-from avp_habitat.rollout import read_rollout
-from avp_habitat.rollout_writer import RolloutWriter
-from avp_habitat.simulators import make_simulator
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.rollout.writing import RolloutWriter
+from avp_habitat.simulators.registry import make_simulator
 
 CAMERA = Intrinsics.from_hfov(320, 240, hfov_deg=90)
 YAW = -1.182

@@ -2,12 +2,12 @@
 
 from corridor import Corridor
 
-from avp_habitat import images
-from avp_habitat.drawing import draw_trajectory
-from avp_habitat.env import AVPEnv
 from avp_habitat.poses import Intrinsics
-from avp_habitat.rollout_writer import RolloutWriter
-from avp_habitat.settings import ACTION_NAMES
+from avp_habitat.rollout import images
+from avp_habitat.rollout.drawing import draw_trajectory
+from avp_habitat.rollout.writing import RolloutWriter
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.settings import ACTION_NAMES
 
 ACTIONS = (0, 1, 0, 4, 2)
 

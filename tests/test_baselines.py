@@ -5,23 +5,28 @@ import numpy as np
 import pytest
 from corridor import Corridor
 
-from avp_habitat.agent_view import AgentView, agent_views
-from avp_habitat.baselines.approach import Approach
-from avp_habitat.baselines.frontier import FrontierPlanner, FrontierPolicy
-from avp_habitat.baselines.frontiers import find_frontiers
-from avp_habitat.baselines.greedy import GreedyPlanner, expected_cells
-from avp_habitat.baselines.known_map import BLOCKED, FREE, OBSERVED, UNKNOWN, KnownMap, known_map
-from avp_habitat.baselines.memory import Memory
-from avp_habitat.baselines.move_search import Start, expected_views, search
-from avp_habitat.baselines.routes import route_to, shortest_walks, walkable
-from avp_habitat.baselines.sight import looking_down, make_lens
-from avp_habitat.baselines.spin import SpinPlanner
-from avp_habitat.env import AVPEnv
-from avp_habitat.policies import make_policy
+from avp_habitat.policies.frontier import Approach, FrontierPlanner, FrontierPolicy, find_frontiers
+from avp_habitat.policies.greedy import GreedyPlanner, Start, expected_cells, expected_views, search
+from avp_habitat.policies.planning import (
+    BLOCKED,
+    FREE,
+    OBSERVED,
+    UNKNOWN,
+    KnownMap,
+    known_map,
+    route_to,
+    shortest_walks,
+    walkable,
+)
+from avp_habitat.policies.predicted_views import looking_down, make_lens
+from avp_habitat.policies.reactive import Memory, SpinPlanner
+from avp_habitat.policies.registry import make_policy
 from avp_habitat.poses import camera_to_world, project
-from avp_habitat.settings import MOVE_FORWARD, STOP, TURN_LEFT, TURN_RIGHT, TaskSettings
-from avp_habitat.simulators import make_simulator
-from avp_sb3.vec_env import AVPVecEnv
+from avp_habitat.simulators.registry import make_simulator
+from avp_habitat.task.agent_view import AgentView, agent_views
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.settings import MOVE_FORWARD, STOP, TURN_LEFT, TURN_RIGHT, TaskSettings
+from avp_sb3.vec_env.batched import AVPVecEnv
 
 SETTINGS = TaskSettings(reward="coverage", width=32, height=24)
 PLANNERS = ("spin", "frontier", "greedy")

@@ -12,8 +12,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 from tracking import SETTINGS, SmallEnv, ppo
 
 from avp_sb3 import AVPVecEnv, MetricsCallback
-from avp_sb3.finished_episodes import MissingInfoError
-from avp_sb3.metrics_callback import EpisodeWindow
+from avp_sb3.callbacks.base import MissingInfoError
+from avp_sb3.callbacks.metrics import EpisodeWindow
 
 EPISODE = {
     "coverage": 0.5, "views": 10.0, "annd_m": 0.2, "ei": 0.05, "stopped": 1.0, "collisions": 2.0,

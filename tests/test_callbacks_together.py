@@ -4,7 +4,7 @@ from rrd import entities, rows, verify
 from stable_baselines3 import PPO
 from tracking import mlflow_home, ppo
 
-from avp_habitat.env import AVPEnv
+from avp_habitat.task.env import AVPEnv
 from avp_sb3 import MetricsCallback, MLflowCallback, RerunCallback
 
 

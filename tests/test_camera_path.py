@@ -8,8 +8,8 @@ from nerfstudio_room import picture, write_room
 from avp_habitat import command
 from avp_habitat.errors import RolloutError
 from avp_habitat.poses import Intrinsics, camera_to_world, rigidity_fault, y_up_to_z_up, yaw_and_pitch
-from avp_habitat.rollout import read_rollout
-from avp_habitat.rollout_writer import RolloutWriter
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.rollout.writing import RolloutWriter
 from avp_nerfstudio.camera_path import Film, camera_path, main, smooth_path
 
 CAMERA = Intrinsics.from_hfov(32, 24, hfov_deg=80.0)
@@ -81,7 +81,7 @@ def test_nerfstudio_reads_the_path_as_the_dataparser_gives_the_poses(tmp_path):
     pytest.importorskip("nerfstudio")
     from nerfstudio.cameras.camera_paths import get_path_from_json
 
-    from avp_nerfstudio.dataparser import AVPDataParserConfig
+    from avp_nerfstudio.data.dataparser import AVPDataParserConfig
 
     walk = write_walk(tmp_path / "walk", l_shaped_walk())
     for scale in (1.0, 0.5):

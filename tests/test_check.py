@@ -9,16 +9,16 @@ from rrd import entities, verify
 
 from avp_habitat import command
 from avp_habitat.errors import UsageError
-from avp_habitat.images import read_depth
 from avp_habitat.poses import camera_to_world, y_up_to_z_up
-from avp_habitat.rollout import read_rollout
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.rollout.images import read_depth
 from avp_habitat.scenes.loader import load_scene
 from avp_nerfstudio.check.__main__ import main
+from avp_nerfstudio.check.cloud import rotation_matrix, rotation_vector
 from avp_nerfstudio.check.depth_maps import load_depth_maps
 from avp_nerfstudio.check.faults import FAULTS, Fault, write_faulty
 from avp_nerfstudio.check.geometry import check_geometry
 from avp_nerfstudio.check.outputs import choose_folder
-from avp_nerfstudio.check.registration import rotation_matrix, rotation_vector
 from avp_nerfstudio.check.shape import check_format
 
 

@@ -6,12 +6,12 @@ from picture_walk import walk_poses, write_walk
 from avp_habitat.collect import Request, collect
 from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.poses import habitat_to_opencv
-from avp_habitat.rollout import read_rollout
-from avp_habitat.settings import TaskSettings
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.task.settings import TaskSettings
 from avp_nerfstudio.check import colmap
 from avp_nerfstudio.check.colmap import SPARSE, export_colmap
-from avp_nerfstudio.check.pictures import check_pictures
-from avp_nerfstudio.check.pictures_matching import match_pictures
+from avp_nerfstudio.check.pictures.evidence import check_pictures
+from avp_nerfstudio.check.pictures.matching import match_pictures
 
 
 @pytest.fixture(scope="module")

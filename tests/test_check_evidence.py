@@ -8,14 +8,13 @@ from picture_walk import CAMERA, walk_poses, write_walk
 from wall_walk import TURNING, WALKING, write_wall
 
 from avp_habitat.poses import camera_to_world
-from avp_habitat.rollout import read_rollout
+from avp_habitat.rollout.format import read_rollout
 from avp_nerfstudio.check.__main__ import Request, check
-from avp_nerfstudio.check.pictures import check_pictures, judge
-from avp_nerfstudio.check.pictures_causes import best_focal_factor
-from avp_nerfstudio.check.pictures_frames import gain_limit
-from avp_nerfstudio.check.pictures_matching import match_pictures
-from avp_nerfstudio.check.pictures_rays import Stacked
-from avp_nerfstudio.check.pictures_relative import estimate_relative_poses
+from avp_nerfstudio.check.pictures.causes import best_focal_factor
+from avp_nerfstudio.check.pictures.evidence import check_pictures, judge
+from avp_nerfstudio.check.pictures.frames import gain_limit
+from avp_nerfstudio.check.pictures.matching import match_pictures
+from avp_nerfstudio.check.pictures.rays import Stacked, estimate_relative_poses
 
 POSES = walk_poses()
 ALL = np.ones(len(POSES), bool)

@@ -7,12 +7,12 @@ from picture_walk import CAMERA, walk_poses, write_walk
 
 from avp_habitat.errors import RolloutError
 from avp_habitat.poses import camera_to_world, habitat_to_opencv, yaw_and_pitch
-from avp_habitat.rollout import read_rollout
-from avp_habitat.rollout_writer import RolloutWriter
-from avp_nerfstudio.check import pictures_matching
-from avp_nerfstudio.check.pictures import check_pictures, judge
-from avp_nerfstudio.check.pictures_matching import match_pictures
-from avp_nerfstudio.check.pictures_rays import NEAREST_M, Stacked, ray_errors
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.rollout.writing import RolloutWriter
+from avp_nerfstudio.check.pictures import matching
+from avp_nerfstudio.check.pictures.evidence import check_pictures, judge
+from avp_nerfstudio.check.pictures.matching import match_pictures
+from avp_nerfstudio.check.pictures.rays import NEAREST_M, Stacked, ray_errors
 
 
 @pytest.fixture(scope="module")
@@ -161,11 +161,11 @@ def test_the_temporary_files_are_removed(walk, tmp_path):
 
 
 def test_the_work_on_a_long_rollout_is_bounded():
-    frames = pictures_matching._choose_frames(10_000)
-    assert len(frames) <= pictures_matching.MAX_FRAMES
+    frames = matching._choose_frames(10_000)
+    assert len(frames) <= matching.MAX_FRAMES
     assert frames[0] == 0
     assert frames[-1] == 9_999
-    pairs = pictures_matching._candidates(len(frames))
-    exhaustive = pictures_matching.EXHAUSTIVE_FRAMES * (pictures_matching.EXHAUSTIVE_FRAMES - 1) // 2
-    assert len(pairs) <= exhaustive + pictures_matching.NEIGHBOURS * len(frames)
+    pairs = matching._candidates(len(frames))
+    exhaustive = matching.EXHAUSTIVE_FRAMES * (matching.EXHAUSTIVE_FRAMES - 1) // 2
+    assert len(pairs) <= exhaustive + matching.NEIGHBOURS * len(frames)
     assert all((i, i + 1) in set(pairs) for i in range(len(frames) - 1))

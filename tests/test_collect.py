@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
-from avp_habitat import command, images
+from avp_habitat import command
 from avp_habitat.collect import main
-from avp_habitat.env import AVPEnv
 from avp_habitat.gpu import nerfacto_line
 from avp_habitat.metrics import nearest_neighbour_distance
-from avp_habitat.rollout import read_rollout
+from avp_habitat.rollout import images
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.task.env import AVPEnv
 
 SMALL = ["--width", "32", "--height", "24"]
 

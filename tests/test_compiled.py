@@ -12,7 +12,7 @@ import pytest
 from no_rights import without_root_rights
 
 ROOT = Path(__file__).resolve().parent.parent
-KERNEL = "import json; from avp_habitat.map_kernel import draw; "
+KERNEL = "import json; from avp_habitat.task.observations import draw; "
 RUN = "print(json.dumps(draw.stats.cache_path))"
 
 

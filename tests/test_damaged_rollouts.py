@@ -17,13 +17,13 @@ from PIL import Image
 from tracking import mlflow_home
 
 from avp_habitat import seen
-from avp_habitat.env import AVPEnv
 from avp_habitat.errors import AVPError, RolloutError
-from avp_habitat.images import read_depth, read_rgb
 from avp_habitat.poses import Intrinsics
-from avp_habitat.rollout import read_meta, read_rollout
-from avp_habitat.rollout_capture import capture_heldout, capture_step, publish_rollout
-from avp_habitat.rollout_writer import RolloutWriter
+from avp_habitat.rollout.capture import capture_heldout, capture_step, publish_rollout
+from avp_habitat.rollout.format import read_meta, read_rollout
+from avp_habitat.rollout.images import read_depth, read_rgb
+from avp_habitat.rollout.writing import RolloutWriter
+from avp_habitat.task.env import AVPEnv
 from avp_habitat.tracking.rollout_run import rollout_run
 
 ACTIONS = (0, 1, 0)
@@ -187,7 +187,7 @@ DAMAGES = {
 
 
 def avp_data(folder):
-    from avp_nerfstudio.dataparser import AVPDataParserConfig
+    from avp_nerfstudio.data.dataparser import AVPDataParserConfig
 
     parser = AVPDataParserConfig(data=folder).setup()
     for split in ("train", "val"):
@@ -208,8 +208,8 @@ def seen_json(folder):
 
 
 def importer(folder):
-    from avp_sb3.rerun_destination import Destination
-    from avp_sb3.rerun_recording import recording_bytes
+    from avp_sb3.rerun.destination import Destination
+    from avp_sb3.rerun.recording import recording_bytes
 
     destination = Destination(application_id="a", recording_id=None, prefix="", times={}, own=True)
     assert recording_bytes([read_rollout(folder)], destination)

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from avp_habitat.observation import NAMES
 from avp_habitat.poses import camera_to_world, y_up_to_z_up
-from avp_habitat.rewards import RewardConstants
-from avp_habitat.settings import ACTION_NAMES
+from avp_habitat.task.observations import NAMES
+from avp_habitat.task.rewards import RewardConstants
+from avp_habitat.task.settings import ACTION_NAMES
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -61,24 +61,24 @@ def test_a_wrong_navigation_would_be_found(nav, fault):
     assert nav_faults(nav, {"a.md", "b.md"}) == [fault]
 
 
-def undocumented(modules):
-    """Modules that stand nowhere in the reference, or more than once."""
-    page = (DOCS / "reference/internal.md").read_text(encoding="utf-8")
-    times = Counter(docs_modules.shown() + docs_modules.internal(page))
-    return sorted(name for name in {*modules, *times} if times[name] != 1 or name not in modules)
+def faults_of_reference(modules):
+    """Modules that the reference shows more than once, or that are gone."""
+    times = Counter(docs_modules.shown())
+    return sorted(name for name in times if times[name] != 1 or name not in modules)
 
 
-def test_every_module_stands_once_in_the_reference_or_among_the_internal_ones():
-    assert undocumented(docs_modules.modules()) == []
+def test_the_reference_shows_no_module_twice_and_none_that_is_gone():
+    assert faults_of_reference(docs_modules.modules()) == []
 
 
-def test_a_module_that_stands_nowhere_would_be_found():
-    assert "avp_habitat.new" in undocumented({**docs_modules.modules(), "avp_habitat.new": ROOT / "new.py"})
+def test_a_module_that_is_gone_would_be_found():
+    left = {name: path for name, path in docs_modules.modules().items() if name != "avp_habitat.poses"}
+    assert faults_of_reference(left) == ["avp_habitat.poses"]
 
 
-def test_an_internal_module_that_is_gone_is_named():
-    with pytest.raises(ValueError, match=r"avp_habitat\.gone is no module"):
-        docs_modules.internal("- avp_habitat.gone\n")
+def test_every_other_module_stands_among_the_internal_ones():
+    named = re.findall(r"^\| `([\w.]+)` \|", docs_modules.tables(), re.MULTILINE)
+    assert sorted([*named, *docs_modules.shown()]) == sorted(docs_modules.modules())
 
 
 def test_every_module_says_what_it_is():
@@ -179,7 +179,7 @@ def test_the_pages_build_without_warnings_and_fetch_nothing_from_elsewhere(tmp_p
 
 @pytest.mark.slow
 def test_a_docstring_that_names_a_parameter_that_is_not_there_ends_the_build(tmp_path):
-    for name in ("docs", "avp_habitat", "avp_sb3", "avp_nerfstudio", "scripts"):
+    for name in ("docs", *docs_modules.PACKAGES, "scripts"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("mkdocs.yml", "CONTRIBUTING.md"):
         shutil.copy(ROOT / name, tmp_path)

@@ -175,13 +175,13 @@ def plug(host, group, name, obj):
 
 
 def test_a_plug_that_its_host_does_not_see_is_broken_and_says_why():
-    here = plug("gymnasium", "registration on import", "AVP-v0", "avp_habitat.env:AVPEnv")
-    away = plug("gymnasium", "registration on import", "AVP-v9", "avp_habitat.env:AVPEnv")
-    wrapper = plug("gymnasium", "wrapper", "Settings", "avp_habitat.settings:TaskSettings")
+    here = plug("gymnasium", "registration on import", "AVP-v0", "avp_habitat.task.env:AVPEnv")
+    away = plug("gymnasium", "registration on import", "AVP-v9", "avp_habitat.task.env:AVPEnv")
+    wrapper = plug("gymnasium", "wrapper", "Settings", "avp_habitat.task.settings:TaskSettings")
     marks = check_host("gymnasium", [here, away, wrapper])
     assert [finding.mark for finding in marks] == [OK, BROKEN, BROKEN]
     assert "does not see it (VersionNotFound" in marks[1].text
-    assert "avp_habitat.settings:TaskSettings is no Wrapper" in marks[2].text
+    assert "avp_habitat.task.settings:TaskSettings is no Wrapper" in marks[2].text
 
 
 def test_an_entry_point_that_the_installed_suite_does_not_have_is_broken():
@@ -235,7 +235,7 @@ def test_the_weights_of_lpips_are_looked_for_where_torch_keeps_them(monkeypatch,
 
 def test_the_path_of_the_weights_is_the_one_that_reconstructions_use(monkeypatch, tmp_path):
     pytest.importorskip("torch")
-    from avp_nerfstudio.scores import lpips_weights_path
+    from avp_nerfstudio.method.scores import lpips_weights_path
 
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     path = lpips_weights_path()

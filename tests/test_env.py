@@ -9,15 +9,15 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import avp_habitat
-from avp_habitat.baselines import HeuristicPolicy, RandomPolicy
-from avp_habitat.coverage import candidates
-from avp_habitat.env import AVPEnv
 from avp_habitat.errors import SceneError, UsageError
-from avp_habitat.heldout import heldout_poses
+from avp_habitat.policies.reactive import HeuristicPolicy, RandomPolicy
 from avp_habitat.poses import Intrinsics, project, unproject
-from avp_habitat.settings import MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, TaskSettings
-from avp_habitat.simulators import make_simulator
-from avp_habitat.surfaces import scene_surface
+from avp_habitat.rollout.capture import heldout_poses
+from avp_habitat.sight.coverage import candidates
+from avp_habitat.simulators.registry import make_simulator
+from avp_habitat.surface.points import scene_surface
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.settings import MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, TaskSettings
 from avp_sb3 import AVPVecEnv
 
 SMALL = {"width": 32, "height": 24}

@@ -18,18 +18,16 @@ from stable_baselines3 import PPO
 from tracking import mlflow_home
 
 from avp_habitat import command
-from avp_habitat.drawing import draw_trajectory
-from avp_habitat.env import AVPEnv
-from avp_habitat.episode import steps_of
 from avp_habitat.errors import PolicyError
-from avp_habitat.images import read_rgb
-from avp_habitat.policies import make_policy
-from avp_habitat.rewards import RewardConstants
-from avp_habitat.settings import TaskSettings
+from avp_habitat.policies.registry import make_policy, steps_of
+from avp_habitat.rollout.drawing import draw_trajectory
+from avp_habitat.rollout.images import read_rgb
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.rewards import RewardConstants
+from avp_habitat.task.settings import TaskSettings
 from avp_sb3.evaluate import main
-from avp_sb3.evaluation import PolicyResult, evaluate_policy
-from avp_sb3.evaluation_report import ReportError, read_report, summary, table, write_report
-from avp_sb3.evaluation_statistics import held_curve, mean_and_half_width
+from avp_sb3.evaluation.policy import PolicyResult, evaluate_policy, held_curve, mean_and_half_width
+from avp_sb3.evaluation.report import ReportError, read_report, summary, table, write_report
 
 SETTINGS = TaskSettings(budget=6, width=16, height=12)
 WORDS = ["--scene", "builtin:0", "--budget", "6", "--width", "16", "--height", "12"]
@@ -282,7 +280,7 @@ def test_an_interrupted_evaluation_keeps_its_episodes(tmp_path, monkeypatch, cap
         if bar.n == 3:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("avp_habitat.progress.tqdm.update", interrupt)
+    monkeypatch.setattr("avp_habitat.command.tqdm.update", interrupt)
     words = ["--policy", "random", "--policy", "heuristic", "--policy", "spin", "--no-mlflow", "--episodes", "2"]
     assert evaluate(*words, "--out", tmp_path / "kept") == 130
     assert "interrupted after 3 episodes, which are kept" in capsys.readouterr().out

@@ -30,17 +30,15 @@ from stable_baselines3.common.vec_env import (
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tracking import SETTINGS, SmallEnv, mlflow_home, ppo
 
-from avp_habitat.drawing import draw_trajectory
-from avp_habitat.env import AVPEnv
 from avp_habitat.errors import SceneError, UsageError
-from avp_habitat.settings import TaskSettings
+from avp_habitat.rollout.drawing import draw_trajectory
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.settings import TaskSettings
 from avp_sb3 import AVPVecEnv, EvaluationCallback, MetricsCallback, MLflowCallback, evaluate_policy
-from avp_sb3.best_model import BestModel, BestModelError
-from avp_sb3.evaluation_batch import means, run_batch, scenes_of
-from avp_sb3.evaluation_picture import draw_curves, evaluation_picture
-from avp_sb3.finished_episodes import MissingInfoError
-from avp_sb3.fixed_starts import FixedStarts
-from avp_sb3.logged_file import LoggedFile
+from avp_sb3.callbacks.base import LoggedFile, MissingInfoError
+from avp_sb3.callbacks.best_model import BestModel, BestModelError
+from avp_sb3.evaluation.batch import FixedStarts, means, run_batch, scenes_of
+from avp_sb3.evaluation.picture import draw_curves, evaluation_picture
 
 ROOMS = ("builtin:1", "builtin:2")
 ROOM_SETTINGS = TaskSettings(budget=6, width=16, height=12)
@@ -700,7 +698,7 @@ def test_names_by_scene_are_kept_apart_from_the_means():
 def test_a_training_killed_while_it_saves_leaves_no_half_written_best_model(tmp_path):
     code = (
         "import sys, time; from pathlib import Path; sys.path.insert(0, sys.argv[2])\n"
-        "from tracking import ppo; from avp_sb3.best_model import BestModel\n"
+        "from tracking import ppo; from avp_sb3.callbacks.best_model import BestModel\n"
         "best, model, value = BestModel(Path(sys.argv[1]), 'return'), ppo(), 0.0\n"
         "best.start(model)\n"
         "while True:\n    value += 1\n    best.offer(model, value)\n    print(value, flush=True)\n"

@@ -14,19 +14,28 @@ from mlflow import MlflowClient
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from avp_habitat.rollout import read_rollout
-from avp_habitat.settings import TaskSettings
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.task.settings import TaskSettings
 from avp_sb3 import AVPVecEnv, MLflowCallback
-from avp_sb3.best_model import save_model
+from avp_sb3.callbacks.best_model import save_model
 from avp_sb3.presets import TABLE_4
 
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def run(script, *words, folder):
-    """A script of examples/ as a user runs it from the top of a checkout; results go to `folder`."""
+def run(*words, folder):
+    """The training program as a user runs it; results go to `folder`."""
+    return _run("-m", "avp_sb3.train", *words, folder=folder)
+
+
+def demo(*words, folder):
+    """The demo as a user runs it; results go to `folder`."""
+    return _run(ROOT / "examples" / "demo.py", *words, folder=folder)
+
+
+def _run(*words, folder):
     env = {**os.environ, "MLFLOW_TRACKING_URI": f"sqlite:///{folder / 'mlflow.db'}", "PYTHONWARNINGS": "ignore"}
-    line = [sys.executable, str(ROOT / "examples" / script), *map(str, words)]
+    line = [sys.executable, *map(str, words)]
     return subprocess.run(line, cwd=folder, env=env, capture_output=True, text=True, timeout=550, check=False)
 
 
@@ -34,7 +43,7 @@ def test_the_training_script_trains_tracks_and_saves(tmp_path):
     camera = ("--width", 16, "--height", 12)
     words = ("--steps", 2048, "--agents", 16, "--out", "model.zip", "--recording", "training.rrd", *camera)
     words += ("--run-name", "tiny", "--eval-scene", "builtin:1", "--eval-every", 1024)
-    done = run("train.py", *words, folder=tmp_path)
+    done = run(*words, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "model.zip: the policy after 2048 steps" in done.stdout
     assert (tmp_path / "training.rrd").stat().st_size > 10_000
@@ -74,7 +83,7 @@ def test_the_training_script_trains_tracks_and_saves(tmp_path):
     ],
 )
 def test_wrong_options_of_the_training_end_before_anything_is_loaded(tmp_path, words, error):
-    done = run("train.py", *words, folder=tmp_path)
+    done = run(*words, folder=tmp_path)
     assert done.returncode == 2
     assert error in done.stderr
     assert "Traceback" not in done.stderr
@@ -84,7 +93,7 @@ def test_wrong_options_of_the_training_end_before_anything_is_loaded(tmp_path, w
 def test_a_scene_that_cannot_be_evaluated_ends_before_a_run_or_a_model_is_made(tmp_path):
     (tmp_path / "model.zip").write_text("an earlier one")
     words = ("--out", "model.zip", "--width", 16, "--height", 12, "--agents", 16, "--eval-scene", "no.glb")
-    done = run("train.py", *words, folder=tmp_path)
+    done = run(*words, folder=tmp_path)
     assert done.returncode == 1
     assert "no.glb" in done.stderr
     assert "Traceback" not in done.stderr
@@ -95,7 +104,7 @@ def test_a_scene_that_cannot_be_evaluated_ends_before_a_run_or_a_model_is_made(t
 @pytest.mark.slow
 def test_the_training_script_trains_with_a_process_for_each_scene(tmp_path):
     words = ("--steps", 2048, "--agents", 16, "--scene", "builtin:0", "builtin:1", "--workers", 2, "--out", "m.zip")
-    done = run("train.py", *words, "--width", 16, "--height", 12, "--eval-scene", "builtin:2", folder=tmp_path)
+    done = run(*words, "--width", 16, "--height", 12, "--eval-scene", "builtin:2", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "m.zip: the policy after 2048 steps" in done.stdout
     client = MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
@@ -107,17 +116,17 @@ def test_the_training_script_trains_with_a_process_for_each_scene(tmp_path):
 @pytest.mark.slow
 def test_a_training_goes_on_from_the_model_in_its_mlflow_run(tmp_path):
     words = ("--agents", 16, "--out", "model.zip", "--width", 16, "--height", 12)
-    first = run("train.py", *words, "--steps", 2048, folder=tmp_path)
+    first = run(*words, "--steps", 2048, folder=tmp_path)
     assert first.returncode == 0, first.stderr
     client = MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     (found,) = client.search_runs(["1"])
     (tmp_path / "model.zip").unlink()
     address = f"runs:/{found.info.run_id}/model.zip"
-    second = run("train.py", *words, "--steps", 4096, "--resume", address, folder=tmp_path)
+    second = run(*words, "--steps", 4096, "--resume", address, folder=tmp_path)
     assert second.returncode == 0, second.stderr
     assert "model.zip: the policy after 4096 steps" in second.stdout
     for wrong in (f"runs:/{found.info.run_id}/nothing.zip", "runs:/" + "0" * 32 + "/model.zip"):
-        failed = run("train.py", *words, "--resume", wrong, folder=tmp_path)
+        failed = run(*words, "--resume", wrong, folder=tmp_path)
         assert failed.returncode == 2
         assert f"--resume {wrong}: not found at sqlite:///" in failed.stderr
         assert "Traceback" not in failed.stderr
@@ -126,7 +135,7 @@ def test_a_training_goes_on_from_the_model_in_its_mlflow_run(tmp_path):
 @pytest.mark.slow
 def test_an_interrupted_training_keeps_its_model_and_goes_on_by_the_printed_command(tmp_path):
     env = {**os.environ, "MLFLOW_TRACKING_URI": f"sqlite:///{tmp_path / 'mlflow.db'}", "PYTHONWARNINGS": "ignore"}
-    line = [sys.executable, str(ROOT / "examples" / "train.py"), "--agents", "8", "--rays", "--out", "model.zip"]
+    line = [sys.executable, "-m", "avp_sb3.train", "--agents", "8", "--rays", "--out", "model.zip"]
     line += ["--width", "16", "--height", "12"]
     training = subprocess.Popen(line, cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     client, steps = MlflowClient(env["MLFLOW_TRACKING_URI"]), 0
@@ -142,9 +151,9 @@ def test_an_interrupted_training_keeps_its_model_and_goes_on_by_the_printed_comm
     assert (tmp_path / "model.zip").exists()
     (again,) = [text.removeprefix("to go on:") for text in out.splitlines() if text.startswith("to go on:")]
     words = shlex.split(again)
-    assert words[:2] == ["python", "examples/train.py"]
+    assert words[:3] == ["python", "-m", "avp_sb3.train"]
     done = int(out.split("the policy after ")[1].split()[0])
-    resumed = run("train.py", *words[2:], "--steps", done + 1, folder=tmp_path)
+    resumed = run(*words[3:], "--steps", done + 1, folder=tmp_path)
     assert resumed.returncode == 0, resumed.stderr
     assert f"model.zip: the policy after {done + 2048} steps" in resumed.stdout
     (found,) = client.search_runs(["1"])
@@ -161,7 +170,7 @@ def sampled_steps(client):
 @pytest.mark.slow
 def test_the_demo_compares_three_methods_and_is_not_repeated(tmp_path):
     words = ("--out", "d", "--steps", 2048, "--iterations", 20, "--width", 40, "--height", 32)
-    done = run("demo.py", *words, folder=tmp_path)
+    done = demo(*words, folder=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     table = json.loads((tmp_path / "d" / "table.json").read_text())["methods"]
     assert set(table) == {"heuristic", "random", "learned"}
@@ -173,10 +182,10 @@ def test_the_demo_compares_three_methods_and_is_not_repeated(tmp_path):
         )
     assert (tmp_path / "d" / "rollouts.rrd").stat().st_size > 10_000
 
-    again = run("demo.py", *words, folder=tmp_path)
+    again = demo(*words, folder=tmp_path)
     assert again.returncode == 0
     assert again.stdout.count("done before") == 11
-    other = run("demo.py", "--out", "d", "--steps", 4096, folder=tmp_path)
+    other = demo("--out", "d", "--steps", 4096, folder=tmp_path)
     assert other.returncode == 2
     assert "holds a demo with other settings" in other.stderr
 
@@ -220,13 +229,13 @@ def test_a_normalised_training_goes_on_with_its_statistics_from_a_file_and_from_
     save_model(model, tmp_path / "first.zip")
     words = ("--agents", 16, "--width", 16, "--height", 12, "--steps", 4096)
     for resume, out in (("first.zip", "a.zip"), (f"runs:/{tracking.run_id}/model.zip", "b.zip")):
-        done = run("train.py", *words, "--resume", resume, "--out", out, folder=tmp_path)
+        done = run(*words, "--resume", resume, "--out", out, folder=tmp_path)
         assert done.returncode == 0, done.stderr
         with (tmp_path / out.replace(".zip", "_vecnormalize.pkl")).open("rb") as file:
             # One more than twice the steps of one training: observations of the start count, too.
             assert pickle.load(file).obs_rms.count > 4096
     (tmp_path / "first_vecnormalize.pkl").unlink()
-    refused = run("train.py", *words, "--resume", "first.zip", "--out", "c.zip", folder=tmp_path)
+    refused = run(*words, "--resume", "first.zip", "--out", "c.zip", folder=tmp_path)
     assert refused.returncode == 1
     assert "first.zip: trained under VecNormalize" in refused.stderr
     assert not (tmp_path / "c.zip").exists()

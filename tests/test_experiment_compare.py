@@ -88,7 +88,7 @@ def test_every_table_and_figure_is_made_again_from_the_stored_results(done):
     before = {path.name: path.read_bytes() for path in folder.glob("*.[mc][ds]*") if path.suffix in (".md", ".csv")}
     for path in (*folder.glob("*.md"), *folder.glob("*.csv"), *folder.glob("*.png")):
         path.unlink()
-    answer = run(done, sys.executable, "-m", "experiment.report", str(folder))
+    answer = run(done, sys.executable, "-m", "avp_experiment.report", str(folder))
     assert answer.returncode == 0, answer.stderr
     assert {name: (folder / name).read_bytes() for name in before} == before
     assert all((folder / f"{name}.png").is_file() for name in FIGURES)

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from small_rollout import write_small_rollout
 
-from avp_habitat import images
+from avp_experiment.top_down import floor_map, floor_of
 from avp_habitat.errors import RolloutError
-from experiment.floor_map import floor_map, floor_of
+from avp_habitat.rollout import images
 
 
 def with_floor(folder, numbers):

@@ -6,14 +6,13 @@ from itertools import groupby
 
 import pytest
 
+from avp_experiment import compare
+from avp_experiment.cells import COLLECT, RECONSTRUCT, TRAIN, plan
+from avp_experiment.configuration import DEFAULT, METHODS, Configuration, Scene, chosen_methods, keep
+from avp_experiment.look import look_of
+from avp_experiment.presets import PRESETS
+from avp_experiment.store import Store
 from avp_habitat import command
-from experiment import compare
-from experiment.cells import COLLECT, RECONSTRUCT, TRAIN, plan
-from experiment.configuration import Configuration, Scene, keep
-from experiment.look import look_of
-from experiment.methods import DEFAULT, METHODS, chosen_methods
-from experiment.presets import PRESETS
-from experiment.store import Store
 
 SCENES = (Scene("a.glb", "a.glb", "11", "train"), Scene("dir/b.glb", "b.glb", "22", "unseen"))
 

@@ -10,10 +10,10 @@ from experiment_results import SCENES, make_results, write_results
 from PIL import Image
 from scipy import stats
 
+from avp_experiment.report import main, write_report
+from avp_experiment.stored import read_results
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
-from experiment.report import main, write_report
-from experiment.stored import read_results
 
 ROOT = Path(__file__).resolve().parent.parent
 FIGURES = ("figure3", "figure4", "figure5", "figure6", "figure6_unseen", "psnr_by_views", "visibility")
@@ -33,7 +33,7 @@ def whole(tmp_path_factory):
 @pytest.fixture
 def report(tmp_path, monkeypatch):
     """Makes a report without figures, which take most of the time, and returns its folder."""
-    monkeypatch.setattr("experiment.report._figures", lambda shown: {})
+    monkeypatch.setattr("avp_experiment.report._figures", lambda shown: {})
 
     def make(results):
         write_report(write_results(tmp_path, results, pictures=False))
@@ -333,7 +333,7 @@ def test_an_unknown_method_of_the_maps_gets_the_nearest_name(tmp_path, capsys):
 
 
 def test_the_command_stands_on_its_own(tmp_path):
-    line = [sys.executable, "-m", "experiment.report", "--help"]
+    line = [sys.executable, "-m", "avp_experiment.report", "--help"]
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=True)
     assert "results.json" in done.stdout
 

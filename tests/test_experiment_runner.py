@@ -10,8 +10,8 @@ from pathlib import Path
 import experiment_walks
 import pytest
 
-from avp_habitat.rollout import read_rollout
-from experiment.store import DONE, Store
+from avp_experiment.store import DONE, Store
+from avp_habitat.rollout.format import read_rollout
 
 ROOT = Path(__file__).resolve().parent.parent
 PROGRAM = Path(experiment_walks.__file__)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from experiment.statistics import at_views, spearman, views_to_reach
+from avp_experiment.statistics import at_views, spearman, views_to_reach
 
 
 def test_correlation_with_equal_values_is_that_of_scipy():

@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 from corridor import Corridor
 
-from avp_habitat.coverage import candidates
 from avp_habitat.errors import UsageError
-from avp_habitat.lookup import panorama
-from avp_habitat.lookup.disk import TileFiles, cache_folder
-from avp_habitat.lookup.lattice import Lattice
-from avp_habitat.lookup.tables import SceneTables, ViewKey, scene_tables
-from avp_habitat.observation import depth_statistics
 from avp_habitat.poses import Intrinsics, camera_to_world
-from avp_habitat.senses import CastSenses, Views
-from avp_habitat.settings import TaskSettings
-from avp_habitat.simulators import make_simulator
-from avp_habitat.task import ViewpointTask
+from avp_habitat.sight import panorama
+from avp_habitat.sight.coverage import candidates
+from avp_habitat.sight.rows import Lattice, TileFiles, cache_folder
+from avp_habitat.sight.tables import SceneTables, ViewKey, scene_tables
+from avp_habitat.simulators.registry import make_simulator
+from avp_habitat.task.observations import depth_statistics
+from avp_habitat.task.perception import CastSenses, Views
+from avp_habitat.task.settings import TaskSettings
+from avp_habitat.task.task import ViewpointTask
 
 SETTINGS = TaskSettings(reward="coverage", lookup=True)
 CAMERA = SETTINGS.intrinsics
@@ -238,7 +237,7 @@ def test_the_frustum_of_the_tables_is_that_of_the_definition(room):
     # A narrow, off-centre camera: swapped axes or a forgotten principal point would show.
     camera = Intrinsics(40, 90, 50.0, 60.0, 12.0, 70.0)
     views = views_at(room.area, 10, seed=5)
-    from avp_habitat.lookup.kernels import _in_view
+    from avp_habitat.sight.kernels import _in_view
 
     centres = room.area.centres
     expected = candidates(views.camera_to_world, camera, centres, np.ones((10, len(centres)), bool), max_range_m=4.0)

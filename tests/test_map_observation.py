@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from corridor import Corridor
 
-from avp_habitat.map_observation import CELL_M, CHANNELS, SIDE, MapObserver
-from avp_habitat.rewards import RewardConstants
-from avp_habitat.settings import TaskSettings
-from avp_habitat.task import ViewpointTask
+from avp_habitat.task.observations import CELL_M, CHANNELS, SIDE, MapObserver
+from avp_habitat.task.rewards import RewardConstants
+from avp_habitat.task.settings import TaskSettings
+from avp_habitat.task.task import ViewpointTask
 
 AREA = Corridor().area
 CELLS = len(AREA.centres)

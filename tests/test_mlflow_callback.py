@@ -17,12 +17,12 @@ from tracking_server import free_port
 
 from avp_habitat.errors import UsageError
 from avp_habitat.provenance import flat
-from avp_habitat.simulators import make_simulator
+from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.tracking import deliver
-from avp_habitat.tracking.addresses import TrackingError
-from avp_habitat.tracking.remote import find_run
+from avp_habitat.tracking.names import find_run
+from avp_habitat.tracking.stores import TrackingError
 from avp_sb3 import MetricsCallback, MLflowCallback
-from avp_sb3.run_facts import hyperparameters, run_name
+from avp_sb3.callbacks.run_facts import hyperparameters, run_name
 
 TESTS = Path(__file__).parent
 
@@ -87,7 +87,7 @@ def test_the_stored_model_loads_acts_and_names_its_run(client, tmp_path):
 
 
 def test_the_last_trajectory_is_a_picture_of_the_run(client, tmp_path):
-    from avp_habitat.images import read_rgb
+    from avp_habitat.rollout.images import read_rgb
 
     callback = MLflowCallback(log_model=False)
     ppo().learn(64, callback=callback)

@@ -14,8 +14,8 @@ from tracking import mlflow_home
 
 from avp_habitat.tracking.names import Names, safe_name
 from avp_habitat.tracking.opening import NewRun, start_run
-from avp_sb3.logged_file import NOT_FOR, LoggedFile
-from avp_sb3.mlflow_writer import MLflowWriter
+from avp_sb3.callbacks.base import NOT_FOR, LoggedFile
+from avp_sb3.callbacks.mlflow import MLflowWriter
 
 
 @given(st.text(max_size=400))

@@ -25,7 +25,7 @@ def words_of(name):
 def options_of(words):
     """What the command's own parser makes of a command line."""
     assert words[:2] == ["python", "-m"]
-    name, *rest = words[3:] if words[2] == "experiment.part" else words[2:]
+    name, *rest = words[3:] if words[2] == "avp_experiment.part" else words[2:]
     if name.endswith(".py"):
         return runpy.run_path(str(ROOT / name))["_parser"]().parse_args(rest)
     return importlib.import_module(name)._parser().parse_args(rest)
@@ -79,7 +79,7 @@ def test_a_python_without_the_packages_is_told_in_one_line(name):
 @pytest.mark.parametrize("name", [name for name in POINTS if name != "compare"])
 def test_a_part_takes_its_words_and_answers_as_it_does_alone(name):
     target = words_of(name)[3]
-    lines = (["-m", "experiment.part", target], [target] if target.endswith(".py") else ["-m", target])
+    lines = (["-m", "avp_experiment.part", target], [target] if target.endswith(".py") else ["-m", target])
     through, alone = (
         subprocess.run([sys.executable, *line, "--no-such"], cwd=ROOT, capture_output=True, text=True) for line in lines
     )

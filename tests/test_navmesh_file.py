@@ -8,12 +8,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from avp_habitat.errors import SceneError
-from avp_habitat.lookup.tables import scene_tables
-from avp_habitat.navigation.navmesh_file import read_navmesh
+from avp_habitat.navigation.navmesh import read_navmesh
 from avp_habitat.scenes.loader import load_scene
-from avp_habitat.settings import TaskSettings
-from avp_habitat.simulators import make_simulator
+from avp_habitat.sight.tables import scene_tables
 from avp_habitat.simulators.raycast import RaycastSimulator
+from avp_habitat.simulators.registry import make_simulator
+from avp_habitat.task.settings import TaskSettings
 
 AGENT = {"agent_height": 1.5, "agent_radius": 0.1, "agent_max_climb": 0.2, "agent_max_slope": 45.0}
 # Two squares that share an edge at x = 1, seen from above with z downwards, and one apart.

@@ -11,10 +11,9 @@ import nerfstudio.scripts.train  # noqa: F401  nerfstudio's modules import each 
 from nerfstudio.cameras.rays import Frustums, RaySamples
 from nerfstudio.field_components.field_heads import FieldHeadNames
 
-from avp_nerfstudio.carving import SurfaceGrid, measured_points
-from avp_nerfstudio.config import trainer_config
-from avp_nerfstudio.dataparser import AVPDataParserConfig
-from avp_nerfstudio.dataset import RGBDDataset
+from avp_nerfstudio.data.dataparser import AVPDataParserConfig, RGBDDataset
+from avp_nerfstudio.method.config import trainer_config
+from avp_nerfstudio.method.model import SurfaceGrid, measured_points
 
 BOX = torch.tensor([[0.0, -1.0, 0.0], [2.0, 1.0, 1.0]])
 

@@ -12,7 +12,7 @@ pytest.importorskip("nerfstudio")
 from nerfstudio.utils.eval_utils import eval_load_checkpoint
 
 from avp_habitat.errors import AVPError
-from avp_nerfstudio.checkpoints import UnsafeCheckpointError, allow_checkpoints
+from avp_nerfstudio.method.checkpoints import UnsafeCheckpointError, allow_checkpoints
 
 
 class RunsCode:

@@ -19,7 +19,7 @@ from nerfstudio_room import ROOM, picture, random_poses, write_room
 from nerfstudio_shell import Shell
 
 from avp_habitat.poses import Intrinsics, camera_to_world
-from avp_habitat.rollout_writer import RolloutWriter
+from avp_habitat.rollout.writing import RolloutWriter
 
 pytest.importorskip("nerfstudio")
 
@@ -27,7 +27,7 @@ import imageio_ffmpeg
 from PIL import Image
 
 from avp_nerfstudio.camera_path import Film, camera_path
-from avp_nerfstudio.checkpoints import allow_checkpoints
+from avp_nerfstudio.method.checkpoints import allow_checkpoints
 
 WIDTH, HEIGHT, FRAMES, HELDOUT, ITERATIONS = 48, 36, 8, 2, 200
 SMALL = ["--pipeline.datamanager.train-num-rays-per-batch", 128, "--pipeline.model.log2-hashmap-size", 10]

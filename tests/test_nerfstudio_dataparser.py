@@ -11,19 +11,19 @@ from nerfstudio_room import ROOM, distance_to_walls, random_poses, write_room
 from PIL import Image
 
 from avp_habitat.errors import RolloutError
-from avp_habitat.images import read_depth, read_rgb
 from avp_habitat.poses import camera_to_world, project, z_up_to_y_up
-from avp_habitat.rollout import read_rollout
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.rollout.images import read_depth, read_rgb
 
 pytest.importorskip("nerfstudio")
 
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.datasets.depth_dataset import DepthDataset
 
-from avp_nerfstudio import verification
-from avp_nerfstudio.dataparser import AVPDataParserConfig, UnusableRolloutError
-from avp_nerfstudio.seen_points import MOST_VIEWS
-from avp_nerfstudio.selection import spread_order
+from avp_nerfstudio.data import verification
+from avp_nerfstudio.data.dataparser import AVPDataParserConfig, UnusableRolloutError
+from avp_nerfstudio.data.frames import spread_order
+from avp_nerfstudio.data.seen_points import MOST_VIEWS
 
 Z_UP = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0]])
 

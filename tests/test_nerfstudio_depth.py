@@ -5,16 +5,15 @@ import pytest
 import torch
 from nerfstudio_room import write_room
 
-from avp_habitat.images import read_depth
+from avp_habitat.rollout.images import read_depth
 
 pytest.importorskip("nerfstudio")
 
 import nerfstudio.scripts.train  # noqa: F401  nerfstudio's modules import each other in circles; this way round is its own
 
-from avp_nerfstudio.config import trainer_config
-from avp_nerfstudio.dataparser import AVPDataParserConfig
-from avp_nerfstudio.dataset import RGBDDataset
-from avp_nerfstudio.depth_loss import termination_loss
+from avp_nerfstudio.data.dataparser import AVPDataParserConfig, RGBDDataset
+from avp_nerfstudio.method.config import trainer_config
+from avp_nerfstudio.method.model import termination_loss
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ import tyro
 from nerfstudio.configs.dataparser_configs import dataparsers
 
 from avp_nerfstudio.check.__main__ import main as check
-from avp_nerfstudio.dataparser import AVPDataParserConfig
+from avp_nerfstudio.data.dataparser import AVPDataParserConfig
 
 
 def frame(index, **more):
@@ -192,7 +192,7 @@ def test_the_parser_that_is_named_reads_the_folder(tmp_path, kind):
 def test_every_parser_and_converter_that_is_named_exists():
     from nerfstudio.scripts.process_data import Commands
 
-    from avp_nerfstudio import foreign
+    from avp_nerfstudio.data import foreign
 
     text = " ".join(how for _, _, how in foreign._KINDS)
     assert set(re.findall(r"parser ([\w-]+) ?", text.replace("no parser of", ""))) <= set(dataparsers)

@@ -6,7 +6,7 @@ pytest.importorskip("nerfstudio")
 from nerfstudio.field_components.encodings import HashEncoding
 from nerfstudio.field_components.mlp import MLPWithHashEncoding
 
-from avp_nerfstudio.hash_encoding import CompiledHashEncoding, compile_hash_encodings
+from avp_nerfstudio.method.hash_encoding import CompiledHashEncoding, compile_hash_encodings
 
 
 @pytest.fixture(params=[(5, 2, 8), (3, 4, 12)], ids=["crowded table", "roomy table"])

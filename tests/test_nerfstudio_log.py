@@ -22,11 +22,10 @@ from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
 import avp_nerfstudio.log
 from avp_habitat import command
-from avp_habitat.images import read_rgb
-from avp_nerfstudio.dataparser import AVPDataParserConfig
-from avp_nerfstudio.heldout_pictures import error_colours, triptych
-from avp_nerfstudio.heldout_views import HeldoutView, render_views
-from avp_nerfstudio.trained_run import open_trained, read_config
+from avp_habitat.rollout.images import read_rgb
+from avp_nerfstudio.data.dataparser import AVPDataParserConfig
+from avp_nerfstudio.data.heldout import HeldoutView, error_colours, render_views, triptych
+from avp_nerfstudio.tracking.trained_run import open_trained, read_config
 
 SIZE = (64, 48)
 

@@ -5,7 +5,7 @@ import torch
 
 pytest.importorskip("nerfstudio")
 
-from avp_nerfstudio.lpips import OptionalLPIPS
+from avp_nerfstudio.method.scores import OptionalLPIPS
 
 
 @pytest.fixture

@@ -9,16 +9,16 @@ import torch
 from nerfstudio_room import distance_to_walls, write_room
 from nerfstudio_shell import Shell
 
-from avp_habitat.images import read_depth
 from avp_habitat.poses import z_up_to_y_up
+from avp_habitat.rollout.images import read_depth
 
 pytest.importorskip("nerfstudio")
 
 # nerfstudio's modules import each other in circles; this way round is its own.
 from nerfstudio.configs.method_configs import method_configs
 
-from avp_nerfstudio.dataparser import AVPDataParserConfig
-from avp_nerfstudio.lpips import optional_lpips
+from avp_nerfstudio.data.dataparser import AVPDataParserConfig
+from avp_nerfstudio.method.scores import optional_lpips
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from avp_nerfstudio.scores import Scores, ScoresError, lpips_weights_path, read_scores
+from avp_nerfstudio.method.scores import Scores, ScoresError, lpips_weights_path, read_scores
 
 
 def write(path, results):

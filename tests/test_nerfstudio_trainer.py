@@ -15,11 +15,10 @@ from nerfstudio_training import tiny_config, train
 from rrd import entities, rows, verify
 
 from avp_habitat.errors import AVPError
-from avp_nerfstudio.interruption import Interruption
-from avp_nerfstudio.tracking_facts import facts_of, rollout_folders
-from avp_nerfstudio.tracking_mlflow import open_run, remembered_id
-from avp_nerfstudio.trainer import AVPTrainer, AVPTrainerConfig, TrainingError
-from avp_nerfstudio.training_progress import TrainingProgress
+from avp_nerfstudio.method.progress import TrainingProgress
+from avp_nerfstudio.method.trainer import AVPTrainer, AVPTrainerConfig, Interruption, TrainingError
+from avp_nerfstudio.tracking.facts import facts_of, rollout_folders
+from avp_nerfstudio.tracking.mlflow import open_run, remembered_id
 
 
 @pytest.fixture
@@ -282,7 +281,7 @@ def test_a_log_gets_a_line_with_rate_and_time_left_now_and_then(capsys, monkeypa
     progress = TrainingProgress(total=10)
     progress.update({"loss": 1.0})
     assert capsys.readouterr().err == ""
-    monkeypatch.setattr("avp_nerfstudio.training_progress._LINE_EVERY_S", 0.0)
+    monkeypatch.setattr("avp_nerfstudio.method.progress._LINE_EVERY_S", 0.0)
     progress.update({"loss": torch.tensor(0.25), "psnr": torch.tensor(20.0)})
     line = capsys.readouterr().err
     assert line.startswith("training:  20% 2/10 [")

@@ -6,20 +6,17 @@ from corridor import RayCorridor
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from avp_habitat.agent_view import agent_views
-from avp_habitat.baselines import RandomPolicy
-from avp_habitat.coverage import candidates
-from avp_habitat.env import AVPEnv
 from avp_habitat.errors import UsageError
-from avp_habitat.motion import act, sensor_poses
-from avp_habitat.oracle import OraclePolicy
-from avp_habitat.oracle.cover import greedy_cover
-from avp_habitat.oracle.lattice import lattice_of, make_lattice, pack, unpack, views_from
-from avp_habitat.oracle.plan import make_plan, planned_coverage
-from avp_habitat.oracle.search import BeamSettings, beam_search
-from avp_habitat.oracle.states import start_state
-from avp_habitat.oracle.tour import covering_tour, lattice_poses
-from avp_habitat.settings import STOP, TaskSettings
+from avp_habitat.policies.oracle.lattice import lattice_of, make_lattice, pack, start_state, unpack, views_from
+from avp_habitat.policies.oracle.policy import OraclePolicy, make_plan, planned_coverage
+from avp_habitat.policies.oracle.search import BeamSettings, beam_search
+from avp_habitat.policies.oracle.tour import covering_tour, greedy_cover, lattice_poses
+from avp_habitat.policies.reactive import RandomPolicy
+from avp_habitat.sight.coverage import candidates
+from avp_habitat.task.agent_view import agent_views
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.motion import act, sensor_poses
+from avp_habitat.task.settings import STOP, TaskSettings
 
 SMALL = {"width": 32, "height": 24, "reward": "coverage"}
 NARROW = BeamSettings(width=50)
@@ -188,7 +185,7 @@ def test_an_episode_taken_over_in_the_middle_is_planned_from_there(corridor):
 
 
 def test_every_agent_of_a_vector_environment_follows_its_own_plan(corridor):
-    vec_env = pytest.importorskip("avp_sb3.vec_env").AVPVecEnv(
+    vec_env = pytest.importorskip("avp_sb3.vec_env.batched").AVPVecEnv(
         "corridor", simulator=corridor, agents=2, settings=TaskSettings(**SMALL, budget=6), seed=3
     )
     policy = OraclePolicy.for_env(vec_env, 0)

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from avp_habitat import images
-from avp_habitat.images import encode_png
-from avp_habitat.png import GREY_16, RGB_8, check_png_contents, check_png_structure
 from avp_habitat.poses import Intrinsics
-from avp_habitat.rollout_writer import RolloutWriter
+from avp_habitat.rollout import images
+from avp_habitat.rollout.images import encode_png
+from avp_habitat.rollout.png import GREY_16, RGB_8, check_png_contents, check_png_structure
+from avp_habitat.rollout.writing import RolloutWriter
 
 CAMERA = Intrinsics.from_hfov(12, 8, hfov_deg=75)
 RANDOM = np.random.default_rng(0)
@@ -66,8 +66,8 @@ def test_a_slow_disk_holds_the_rendering_up_instead_of_filling_the_memory(tmp_pa
         lock.wait(0.01)
         written.append(path)
 
-    monkeypatch.setattr("avp_habitat.images.write_rgb", slow)
-    monkeypatch.setattr("avp_habitat.images.write_depth", slow)
+    monkeypatch.setattr("avp_habitat.rollout.images.write_rgb", slow)
+    monkeypatch.setattr("avp_habitat.rollout.images.write_depth", slow)
     with RolloutWriter(tmp_path / "r", CAMERA) as writer:
         for k in range(40):
             writer.add_frame(np.zeros((8, 12, 3), np.uint8), np.ones((8, 12)), np.eye(4))
@@ -84,7 +84,7 @@ def test_pictures_of_an_abandoned_rollout_are_not_written_after_its_end(tmp_path
         threading.Event().wait(0.02)
         real(path, depth)
 
-    monkeypatch.setattr("avp_habitat.images.write_depth", slow)
+    monkeypatch.setattr("avp_habitat.rollout.images.write_depth", slow)
     with RolloutWriter(tmp_path / "r", CAMERA) as writer:
         for _ in range(4):
             writer.add_frame(np.zeros((8, 12, 3), np.uint8), np.ones((8, 12)), np.eye(4))

@@ -7,7 +7,7 @@ from test_scene_placing import box
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.loader import load_scene
 from avp_habitat.scenes.polygons import triangulate
-from avp_habitat.simulators import make_simulator
+from avp_habitat.simulators.registry import make_simulator
 
 WITH_DOOR = [(0, 0), (2, 0), (2, 2), (3, 2), (3, 0), (5, 0), (5, 2.6), (0, 2.6)]
 # A bridge to the window's corner and back, as a hole is written.

@@ -5,7 +5,7 @@ import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv
 from tracking import SmallEnv, mlflow_home, ppo
 
-from avp_habitat import gpu, metrics, progress
+from avp_habitat import command, gpu, metrics
 from avp_sb3 import EvaluationCallback, MetricsCallback, MLflowCallback, RerunCallback
 
 
@@ -14,8 +14,8 @@ def lines(capsys):
 
 
 def test_without_a_terminal_work_tells_its_begin_its_course_and_its_end_in_lines(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "SECONDS", 0.0)
-    for _ in progress.progress(range(3), desc="counting", unit="view"):
+    monkeypatch.setattr(command, "SECONDS", 0.0)
+    for _ in command.progress(range(3), desc="counting", unit="view"):
         pass
     found = lines(capsys)
     assert found[0].startswith("counting: 0 %, 0 of 3 views")
@@ -24,19 +24,19 @@ def test_without_a_terminal_work_tells_its_begin_its_course_and_its_end_in_lines
 
 
 def test_lines_are_seldom(capsys):
-    for _ in progress.progress(range(1000), desc="counting", unit="view"):
+    for _ in command.progress(range(1000), desc="counting", unit="view"):
         pass
     assert len(lines(capsys)) == 2
 
 
 def test_on_a_terminal_it_is_a_bar(monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    with progress.progress(total=3, desc="counting", unit="view") as bar:
+    with command.progress(total=3, desc="counting", unit="view") as bar:
         assert "|" in str(bar)
 
 
 def test_a_training_tells_its_steps_its_rate_and_its_coverage(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "SECONDS", 0.0)
+    monkeypatch.setattr(command, "SECONDS", 0.0)
     ppo(DummyVecEnv([SmallEnv] * 2)).learn(300, callback=MetricsCallback())
     found = lines(capsys)
     assert found[0].startswith("training: 0 %, 0 of 300 steps")

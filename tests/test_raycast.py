@@ -288,7 +288,7 @@ def test_a_simulator_tells_what_it_shows(room):
 DIGEST = """
 import hashlib, tempfile, numpy as np
 from avp_habitat.poses import Intrinsics, camera_to_world
-from avp_habitat.rollout_writer import RolloutWriter
+from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.scenes.loader import Scene
 from avp_habitat.scenes.mesh import TexturedMesh
 from avp_habitat.simulators.raycast import RaycastSimulator

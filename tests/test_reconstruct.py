@@ -13,12 +13,12 @@ from nerfstudio_room import write_room
 pytest.importorskip("nerfstudio")
 
 from avp_habitat import command
-from avp_habitat.images import read_rgb
-from avp_habitat.rollout import read_rollout
-from avp_habitat.rollout_visibility import visibility_of
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.rollout.images import read_rgb
+from avp_habitat.rollout.seen import visibility_of
 from avp_nerfstudio import reconstruct
 from avp_nerfstudio.reconstruct import Request
-from avp_nerfstudio.trained_run import TrainedRunError, config_path
+from avp_nerfstudio.tracking.trained_run import TrainedRunError, config_path
 
 ITERATIONS = ("--iterations", "3")
 
@@ -129,7 +129,7 @@ def test_a_fork_of_a_preloaded_process_scores_the_same(room, tmp_path, monkeypat
     )
     assert done.returncode == 0, done.stderr
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["avp_nerfstudio.reconstruct_imports"])
+    context.set_forkserver_preload(["avp_nerfstudio.method.preload"])
     receive, send = context.Pipe(duplex=False)
     process = context.Process(target=forked, args=([*words, "--out", str(tmp_path / "fork")], send))
     process.start()
@@ -178,14 +178,14 @@ def test_a_missing_or_damaged_rollout_and_a_folder_that_exists_are_refused(room,
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_training_leaves_nothing(room, tmp_path, monkeypatch, capfd, number):
-    from avp_nerfstudio import reconstruct_process
+    from avp_nerfstudio.method import reconstruction
 
-    class Progress(reconstruct_process.TrainingProgress):
+    class Progress(reconstruction.TrainingProgress):
         def update(self, values):
             threading.Timer(0.0, os.kill, (os.getpid(), number)).start()
             super().update(values)
 
-    monkeypatch.setattr(reconstruct_process, "TrainingProgress", Progress)
+    monkeypatch.setattr(reconstruction, "TrainingProgress", Progress)
     assert run(room, "--out", tmp_path / "out", "--iterations", "100000") == command.INTERRUPTED
     assert "interrupted" in capfd.readouterr().err
     assert list(tmp_path.iterdir()) == []

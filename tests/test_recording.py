@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from avp_habitat import command
-from avp_habitat.baselines import RandomPolicy
 from avp_habitat.collect import main as collect
-from avp_habitat.env import AVPEnv
 from avp_habitat.errors import UsageError
+from avp_habitat.policies.reactive import RandomPolicy
 from avp_habitat.recording import RecordRollout
-from avp_habitat.rollout import read_rollout
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.task.env import AVPEnv
 
 SMALL = {"width": 16, "height": 12}
 
@@ -80,7 +80,7 @@ def test_a_failing_disk_is_one_error_and_leaves_nothing(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("avp_habitat.images.write_rgb", full)
+    monkeypatch.setattr("avp_habitat.rollout.images.write_rgb", full)
     # Pictures are written in threads: one of the next steps reports the error, the last one at the latest.
     with pytest.raises(Exception, match="r: cannot write there: No space left"):
         run(env)

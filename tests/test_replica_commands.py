@@ -1,6 +1,5 @@
 """The commands of docs/replica.md, taken from the page and run on rooms that lie on disk as Replica's do."""
 
-import importlib.util
 import json
 import math
 import os
@@ -15,7 +14,7 @@ import pytest
 from replica_layout import replica_layout
 
 from avp_habitat import collect
-from avp_habitat.rollout import read_rollout
+from avp_habitat.rollout.format import read_rollout
 from avp_habitat.scenes.loader import load_scene
 from avp_habitat.scenes.location import locate
 from avp_habitat.tracking import compare
@@ -139,17 +138,14 @@ def program_of(call: list[str]) -> tuple[str, list[str]]:
 
 
 def test_the_programs_of_the_suite_know_every_option_of_the_page(place):
-    spec = importlib.util.spec_from_file_location("train", ROOT / "examples" / "train.py")
-    assert spec is not None
-    assert spec.loader is not None
-    train = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(train)
+    from avp_sb3 import train
+
     calls = [program_of(call) for call in words(place)]
     for name, own in calls:
         if name not in ("ns-train", "ns-eval", "rl_zoo3"):
-            {"examples/train.py": train, **PROGRAMS}[name]._parser().parse_args(own)
+            {"avp_sb3.train": train, **PROGRAMS}[name]._parser().parse_args(own)
     assert Counter(name for name, _ in calls) == {
-        "examples/train.py": 4,
+        "avp_sb3.train": 4,
         "avp_sb3.evaluate": 5,
         "avp_habitat.collect": 5,
         "avp_nerfstudio.log": 5,

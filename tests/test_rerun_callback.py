@@ -20,13 +20,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from tracking import SmallEnv, ppo
 
 from avp_habitat.errors import UsageError
-from avp_habitat.images import DEPTH_UNIT_M
 from avp_habitat.poses import Intrinsics
+from avp_habitat.rollout.images import DEPTH_UNIT_M
 from avp_sb3 import RerunCallback
-from avp_sb3.finished_episodes import MissingInfoError
-from avp_sb3.rerun_episode import Episode, log_episode, spread_indices
-from avp_sb3.rerun_file import RecordingError, RecordingFile
-from avp_sb3.rerun_layout import blueprint
+from avp_sb3.callbacks.base import MissingInfoError
+from avp_sb3.rerun.episode import Episode, log_episode, spread_indices
+from avp_sb3.rerun.file import RecordingError, RecordingFile
+from avp_sb3.rerun.layout import blueprint
 
 
 class Notes(BaseCallback):

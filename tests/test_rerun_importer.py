@@ -14,7 +14,7 @@ from rerun.chunk import RrdReader
 from rrd import chunks, entities, rows, verify
 from small_rollout import ACTIONS, write_small_rollout
 
-from avp_sb3 import rerun_importer
+from avp_sb3.rerun import importer
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 NAMES = ("rerun-importer-avp", "rerun-loader-avp")
@@ -40,7 +40,7 @@ def call(monkeypatch, capfdbinary, tmp_path):
 
     def called(path, *flags, name=NAMES[0]):
         monkeypatch.setattr(sys, "argv", [str(SCRIPTS / name), str(path), *flags])
-        code = rerun_importer.main()
+        code = importer.main()
         out, err = capfdbinary.readouterr()
         target = tmp_path / "answer.rrd"
         target.write_bytes(out)

@@ -17,8 +17,7 @@ from tracking import ppo
 
 from avp_habitat.errors import UsageError
 from avp_sb3 import RerunCallback
-from avp_sb3.rerun_live import LiveError, LiveViewer, program
-from avp_sb3.rerun_relay import Relay
+from avp_sb3.rerun.live import LiveError, LiveViewer, Relay, program
 
 TESTS = Path(__file__).parent
 
@@ -180,7 +179,7 @@ def test_a_web_viewer_is_served_on_loopback_only_and_ends_with_the_callback(tmp_
 
 def test_a_server_does_not_outlive_a_training_that_is_killed(tmp_path):
     command = (
-        "import os, signal; from avp_sb3.rerun_live import LiveViewer; import rerun.blueprint as rrb;"
+        "import os, signal; from avp_sb3.rerun.live import LiveViewer; import rerun.blueprint as rrb;"
         "viewer = LiveViewer('web'); viewer.open('some', rrb.Blueprint()); print(viewer.url, flush=True);"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )
@@ -224,7 +223,7 @@ def test_an_address_where_something_else_listens_is_an_error_at_the_start(delay_
 
 
 def test_an_address_where_somebody_listens_and_says_nothing_is_an_error_at_the_start(monkeypatch):
-    monkeypatch.setattr("avp_sb3.rerun_live._ANSWER_S", 0.5)
+    monkeypatch.setattr("avp_sb3.rerun.live._ANSWER_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         viewer = LiveViewer(address(silent.getsockname()[1]))
         with pytest.raises(LiveError, match=r"no Rerun viewer .it does not answer with HTTP/2"):

@@ -15,11 +15,11 @@ from small_rollout import ACTIONS, write_small_rollout
 from avp_habitat.command import run
 from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.poses import Intrinsics
-from avp_habitat.rollout import read_rollout
-from avp_habitat.rollout_writer import RolloutWriter
-from avp_sb3.rerun_destination import Destination, DestinationRecording
-from avp_sb3.rerun_recording import main, write_rollout_recording
-from avp_sb3.rerun_rollout import read_contents
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.rollout.writing import RolloutWriter
+from avp_sb3.rerun.destination import Destination, DestinationRecording
+from avp_sb3.rerun.recording import main, write_rollout_recording
+from avp_sb3.rerun.rollout import read_contents
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rrd import rows
 
-from avp_habitat.env import AVPEnv
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics
-from avp_habitat.rewards import (
+from avp_habitat.rollout.capture import capture_step, publish_rollout
+from avp_habitat.rollout.writing import RolloutWriter
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.rewards import (
     REWARD_NAMES,
     REWARDS,
     RewardConstants,
@@ -19,13 +21,11 @@ from avp_habitat.rewards import (
     reward_parts,
     stops_episode,
 )
-from avp_habitat.rollout_capture import capture_step, publish_rollout
-from avp_habitat.rollout_writer import RolloutWriter
-from avp_habitat.settings import TaskSettings
+from avp_habitat.task.settings import TaskSettings
 from avp_sb3 import AVPVecEnv
-from avp_sb3.metrics_callback import EpisodeWindow
-from avp_sb3.rerun_recording import write_rollout_recording
-from avp_sb3.rerun_steps import Steps
+from avp_sb3.callbacks.metrics import EpisodeWindow
+from avp_sb3.rerun.recording import write_rollout_recording
+from avp_sb3.rerun.rollout import Steps
 
 # All different and none a special value, so that a swapped or forgotten constant changes a sum.
 CONSTANTS = RewardConstants(

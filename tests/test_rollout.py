@@ -6,14 +6,15 @@ import pytest
 from corridor import Corridor
 from PIL import Image
 
-from avp_habitat import images, poses
-from avp_habitat.env import AVPEnv
+from avp_habitat import poses
 from avp_habitat.errors import RolloutError, UsageError
-from avp_habitat.png import check_png_contents
 from avp_habitat.poses import Intrinsics
-from avp_habitat.rollout import read_rollout
-from avp_habitat.rollout_capture import capture_step, publish_rollout
-from avp_habitat.rollout_writer import RolloutWriter
+from avp_habitat.rollout import images
+from avp_habitat.rollout.capture import capture_step, publish_rollout
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.rollout.png import check_png_contents
+from avp_habitat.rollout.writing import RolloutWriter
+from avp_habitat.task.env import AVPEnv
 
 CAMERA = Intrinsics.from_hfov(12, 8, hfov_deg=75)
 FRAMES, HELDOUT = 3, 2

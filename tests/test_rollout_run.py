@@ -16,10 +16,10 @@ from avp_habitat import command
 from avp_habitat.errors import RolloutError
 from avp_habitat.tracking import deliver
 from avp_habitat.tracking import rollout_run as module
-from avp_habitat.tracking.addresses import TrackingError
 from avp_habitat.tracking.opening import NewRun, start_run
 from avp_habitat.tracking.rollout_facts import figures, rollout_id
 from avp_habitat.tracking.rollout_run import rollout_run
+from avp_habitat.tracking.stores import TrackingError
 
 SMALL = ["--budget", "4", "--width", "32", "--height", "24"]
 

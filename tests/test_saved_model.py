@@ -19,11 +19,10 @@ from tracking import SETTINGS, SmallEnv, mlflow_home, ppo
 
 from avp_habitat import collect, command
 from avp_habitat.errors import PolicyError
-from avp_habitat.policies import described, load_model, make_policy
-from avp_habitat.policy_env import make_policy_env
-from avp_habitat.saved_model import check_harmless, statistics_of
+from avp_habitat.policies.registry import described, load_model, make_policy, make_policy_env
+from avp_habitat.policies.saved_model import check_harmless, statistics_of
 from avp_sb3 import EvaluationCallback, MLflowCallback
-from avp_sb3.best_model import save_model
+from avp_sb3.callbacks.best_model import save_model
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(40, 12)).astype(np.float32)
 

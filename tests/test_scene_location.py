@@ -14,12 +14,11 @@ from replica_layout import DATASET, quads, replica_layout, vertex_colours, write
 
 from avp_habitat.errors import AVPError, SceneError, UsageError
 from avp_habitat.poses import Intrinsics, axes_to_world, camera_to_world
-from avp_habitat.scenes.builtin import generate_room
+from avp_habitat.scenes.builtin.room import generate_room
 from avp_habitat.scenes.export import export_glb
 from avp_habitat.scenes.loader import Scene, load_scene, scene_digest
 from avp_habitat.scenes.location import locate
-from avp_habitat.scenes.mesh import TexturedMesh
-from avp_habitat.scenes.notices import say_once
+from avp_habitat.scenes.mesh import TexturedMesh, say_once
 from avp_habitat.scenes.stage_config import Y_UP, Z_UP
 from avp_habitat.simulators.raycast import RaycastSimulator
 

@@ -268,7 +268,7 @@ def test_a_link_whose_content_was_not_fetched_says_so(tmp_path, name):
 
 
 def test_two_links_to_one_file_are_two_scenes(tmp_path):
-    from avp_habitat.simulators import make_simulator
+    from avp_habitat.simulators.registry import make_simulator
 
     path = export_room(tmp_path / "store.glb")
     for name in ("a.glb", "b.glb"):
@@ -655,7 +655,7 @@ def test_the_white_room_has_its_baked_light(shared):
 
 
 def test_a_generated_room_is_named_by_its_seed_and_generator():
-    from avp_habitat.scenes.builtin import GENERATOR_VERSION
+    from avp_habitat.scenes.builtin.room import GENERATOR_VERSION
 
     scene = load_scene("builtin:007")
     assert scene.name == "builtin:7"

@@ -10,8 +10,8 @@ import pytest
 
 from avp_habitat.errors import UsageError
 from avp_habitat.navigation.settings import NavigationSettings
-from avp_habitat.rewards import RewardConstants
-from avp_habitat.settings import TaskSettings
+from avp_habitat.task.rewards import RewardConstants
+from avp_habitat.task.settings import TaskSettings
 
 KINDS = (TaskSettings, RewardConstants, NavigationSettings)
 

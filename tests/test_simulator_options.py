@@ -2,11 +2,11 @@ import pytest
 
 from avp_habitat import command
 from avp_habitat.collect import main as collect
-from avp_habitat.env import AVPEnv
 from avp_habitat.errors import UsageError
-from avp_habitat.scenes.builtin import generate_room
+from avp_habitat.scenes.builtin.room import generate_room
 from avp_habitat.scenes.export import export_glb
-from avp_habitat.simulators import make_simulator
+from avp_habitat.simulators.registry import make_simulator
+from avp_habitat.task.env import AVPEnv
 from avp_sb3 import AVPVecEnv, EvaluationCallback
 from avp_sb3.evaluate import main as evaluate
 

@@ -13,15 +13,15 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 from tracking import mlflow_home
 
-from avp_habitat.agent_view import agent_views
-from avp_habitat.baselines import HeuristicPolicy
-from avp_habitat.baselines.frontier import FrontierPolicy
 from avp_habitat.errors import SceneError, SimulatorError, UsageError
+from avp_habitat.policies.frontier import FrontierPolicy
+from avp_habitat.policies.reactive import HeuristicPolicy
 from avp_habitat.poses import Intrinsics
-from avp_habitat.settings import TaskSettings
-from avp_habitat.simulators import SimulatorChoice
+from avp_habitat.simulators.registry import SimulatorChoice
+from avp_habitat.task.agent_view import agent_views
+from avp_habitat.task.settings import TaskSettings
 from avp_sb3 import AVPSubprocVecEnv, AVPVecEnv, EvaluationCallback, MetricsCallback, MLflowCallback, RerunCallback
-from avp_sb3.fixed_starts import FixedStarts, FixedStartsInProcesses, fixed_starts
+from avp_sb3.evaluation.batch import FixedStarts, FixedStartsInProcesses, fixed_starts
 
 SETTINGS = TaskSettings(width=16, height=12, budget=6)
 ROOMS = ["builtin:0", "builtin:1"]
@@ -213,7 +213,7 @@ SCRIPT = """
 import sys, time
 import numpy as np
 from avp_habitat import command
-from avp_habitat.settings import TaskSettings
+from avp_habitat.task.settings import TaskSettings
 from avp_sb3 import AVPSubprocVecEnv
 
 def main(argv):

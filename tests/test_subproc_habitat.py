@@ -9,9 +9,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from avp_habitat.env import AVPEnv
 from avp_habitat.errors import SimulatorError, UsageError
-from avp_habitat.settings import TaskSettings
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.settings import TaskSettings
 from avp_sb3 import AVPSubprocVecEnv, EvaluationCallback, zoo
 
 pytestmark = pytest.mark.habitat

@@ -3,15 +3,14 @@ import pytest
 from corridor import ROOM, WALL, Corridor
 
 from avp_habitat import poses
-from avp_habitat.env import AVPEnv
 from avp_habitat.errors import UsageError
-from avp_habitat.lookup.surface import SurfaceTables, surface_tables
-from avp_habitat.settings import TaskSettings
-from avp_habitat.simulators import make_simulator
-from avp_habitat.surface_map import CELL_M, FULL, GROUPS, SIDE, SurfaceMapper
-from avp_habitat.surface_senses import raise_quality
-from avp_habitat.surfaces import EDGE_M, SceneSurface, scene_surface, view_quality
-from avp_habitat.task import ViewpointTask
+from avp_habitat.simulators.registry import make_simulator
+from avp_habitat.surface.map import CELL_M, FULL, GROUPS, SIDE, SurfaceMapper
+from avp_habitat.surface.memory import SurfaceTables, raise_quality, surface_tables
+from avp_habitat.surface.points import EDGE_M, SceneSurface, scene_surface, view_quality
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.settings import TaskSettings
+from avp_habitat.task.task import ViewpointTask
 from avp_sb3.presets import PRESETS
 
 SIMULATOR = Corridor()

@@ -2,9 +2,9 @@ import pytest
 from corridor import Corridor
 from stable_baselines3 import PPO
 
-from avp_habitat.env import AVPEnv
-from avp_habitat.policy_env import make_policy_env
-from avp_habitat.settings import OBSERVATION_NAMES, TaskSettings
+from avp_habitat.policies.registry import make_policy_env
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
 
 
 @pytest.mark.parametrize("kind", OBSERVATION_NAMES)

@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
 
-from avp_habitat.agent_view import agent_views
-from avp_habitat.baselines import RandomPolicy
-from avp_habitat.coverage import candidates
-from avp_habitat.env import AVPEnv
 from avp_habitat.errors import UsageError
-from avp_habitat.motion import sensor_poses
-from avp_habitat.oracle import OraclePolicy, SurveyPolicy
-from avp_habitat.oracle.search import BeamSettings
-from avp_habitat.oracle.surfaces import SPACING_M, surface_points
+from avp_habitat.policies.oracle.lattice import SPACING_M, surface_points
+from avp_habitat.policies.oracle.policy import OraclePolicy, SurveyPolicy
+from avp_habitat.policies.oracle.search import BeamSettings
+from avp_habitat.policies.reactive import RandomPolicy
+from avp_habitat.sight.coverage import candidates
+from avp_habitat.task.agent_view import agent_views
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.motion import sensor_poses
 
 NARROW = BeamSettings(width=50)
 

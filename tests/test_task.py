@@ -7,8 +7,8 @@ from corridor import Corridor, hit_distance
 from avp_habitat import poses
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import pixel_directions
-from avp_habitat.rewards import RewardConstants, StepFacts, reward_parts
-from avp_habitat.settings import (
+from avp_habitat.task.rewards import RewardConstants, StepFacts, reward_parts
+from avp_habitat.task.settings import (
     ACTION_NAMES,
     LOOK_DOWN,
     LOOK_UP,
@@ -18,8 +18,8 @@ from avp_habitat.settings import (
     TURN_RIGHT,
     TaskSettings,
 )
-from avp_habitat.task import ViewpointTask
-from avp_habitat.trajectory import episode_metrics
+from avp_habitat.task.task import ViewpointTask
+from avp_habitat.task.trajectory import episode_metrics
 
 SIMULATOR = Corridor()
 AREA = SIMULATOR.area

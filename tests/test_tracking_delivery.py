@@ -14,11 +14,10 @@ from tracking import mlflow_home
 
 from avp_habitat.errors import UsageError
 from avp_habitat.tracking import deliver
-from avp_habitat.tracking.addresses import TrackingError, address_of, shown
 from avp_habitat.tracking.journal import Journal, spool_folder
-from avp_habitat.tracking.opening import NewRun, continue_run, start_run
-from avp_habitat.tracking.recovery import recover
-from avp_habitat.tracking.remote import PARENT_TAG, find_run
+from avp_habitat.tracking.names import PARENT_TAG, find_run
+from avp_habitat.tracking.opening import NewRun, continue_run, recover, start_run
+from avp_habitat.tracking.stores import TrackingError, address_of, shown
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -16,10 +16,9 @@ from tracking import mlflow_home
 
 from avp_habitat import command
 from avp_habitat.tracking import compare
-from avp_habitat.tracking.addresses import TrackingError, absolute, connect
-from avp_habitat.tracking.database import address_of, file_of
 from avp_habitat.tracking.experiments import experiment_id, meant
 from avp_habitat.tracking.opening import NewRun, start_run
+from avp_habitat.tracking.stores import TrackingError, absolute, connect, file_of, sqlite_address
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -146,7 +145,7 @@ def test_an_address_means_the_same_in_every_folder(tmp_path, monkeypatch, addres
 
 
 def making(folder):
-    code = f"from avp_habitat.tracking.addresses import connect; connect('sqlite:///{folder}/new/mlflow.db')"
+    code = f"from avp_habitat.tracking.stores import connect; connect('sqlite:///{folder}/new/mlflow.db')"
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.Popen([sys.executable, "-c", code], env=env, stderr=subprocess.DEVNULL)
 
@@ -189,7 +188,7 @@ def test_a_database_that_another_program_left_half_made_is_recognised(store, tmp
 def test_a_database_is_made_where_mlflow_looks_for_it_whatever_its_path_holds(tmp_path, folder):
     """SQLAlchemy reads `%20` in an address as a space."""
     path = tmp_path / folder / "mlflow.db"
-    address = address_of(path)
+    address = sqlite_address(path)
     assert file_of(address) == path
     assert absolute(address) == address
     made = connect(address).create_experiment("é")

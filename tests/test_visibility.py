@@ -14,12 +14,10 @@ from avp_habitat import poses, seen
 from avp_habitat.command import run
 from avp_habitat.errors import RolloutError
 from avp_habitat.poses import Intrinsics
-from avp_habitat.rollout import read_rollout
-from avp_habitat.rollout_visibility import visibility_of
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.rollout.seen import visibility_of
 from avp_habitat.scenes.loader import load_scene
-from avp_habitat.simulators.raycast import RaycastSimulator
-from avp_habitat.tracking.rollout_facts import figures
-from avp_habitat.visibility import (
+from avp_habitat.sight.visibility import (
     ALIKE_DEG,
     ALIKE_DISTANCE,
     PARALLAX_DEG,
@@ -29,6 +27,8 @@ from avp_habitat.visibility import (
     points_seen,
     visibility,
 )
+from avp_habitat.simulators.raycast import RaycastSimulator
+from avp_habitat.tracking.rollout_facts import figures
 
 CAMERA = Intrinsics.from_hfov(64, 48, hfov_deg=90)
 CORRIDOR = Corridor()

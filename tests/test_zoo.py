@@ -20,11 +20,11 @@ from tracking import mlflow_home
 
 from avp_habitat import command
 from avp_habitat.collect import main as collect
-from avp_habitat.env import AVPEnv
 from avp_habitat.errors import SceneError, SimulatorError, UsageError
-from avp_habitat.rollout import read_rollout
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.task.env import AVPEnv
 from avp_sb3 import hyperparams, zoo
-from avp_sb3.vec_env import AVPVecEnv
+from avp_sb3.vec_env.batched import AVPVecEnv
 
 SMALL = {"scene": "builtin:0", "width": 16, "height": 12, "budget": 6}
 

@@ -9,9 +9,9 @@ from corridor import Corridor
 from mlflow import MlflowClient
 from stable_baselines3 import PPO
 
-from avp_habitat.env import AVPEnv
-from avp_habitat.rewards import RewardConstants
-from avp_habitat.settings import TaskSettings
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.rewards import RewardConstants
+from avp_habitat.task.settings import TaskSettings
 
 SETTINGS = TaskSettings(budget=8, width=16, height=12, constants=replace(RewardConstants(), stop_coverage=0.1))
 

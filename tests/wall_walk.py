@@ -3,8 +3,8 @@
 import numpy as np
 
 from avp_habitat.poses import Intrinsics, camera_to_world, pixel_directions
-from avp_habitat.rollout import read_rollout
-from avp_habitat.rollout_writer import RolloutWriter
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.rollout.writing import RolloutWriter
 
 CAMERA = Intrinsics.from_hfov(320, 240, hfov_deg=90)
 DISTANCE_M, FARTHEST_M = 2.5, 8.0

@@ -12,7 +12,7 @@ from avp_habitat.doctor.ask_host import HOSTS
 from avp_habitat.doctor.asking import ask
 from avp_habitat.doctor.finding import ABSENT, BROKEN, OK, Finding
 from avp_habitat.doctor.manifest import DISTRIBUTION, Plug, requirements
-from avp_habitat.versions import version_of
+from avp_habitat.provenance import version_of
 
 _HOST_LIMIT_S = 90.0
 _PROGRAM_LIMIT_S = 30.0

@@ -10,7 +10,7 @@ import numpy as np
 
 from avp_habitat.errors import AVPError
 from avp_habitat.poses import Intrinsics
-from avp_habitat.simulators import make_simulator
+from avp_habitat.simulators.registry import make_simulator
 
 _EYE_M = 1.5
 

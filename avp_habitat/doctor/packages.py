@@ -9,7 +9,7 @@ from packaging.specifiers import SpecifierSet
 
 from avp_habitat.doctor.finding import ABSENT, BROKEN, OK, Finding
 from avp_habitat.doctor.manifest import DISTRIBUTION, requirements
-from avp_habitat.versions import version_of
+from avp_habitat.provenance import version_of
 
 _INSTALL = "pip install -e . in the checkout"
 

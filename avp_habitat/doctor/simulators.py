@@ -6,16 +6,16 @@ from pathlib import Path
 from avp_habitat.doctor.asking import ask
 from avp_habitat.doctor.finding import ABSENT, BROKEN, OK, Finding
 from avp_habitat.errors import SimulatorError
+from avp_habitat.provenance import version_of
 from avp_habitat.simulators.habitat.graphics import FIRST_DEVICE, choose_gpu, inspect_graphics
 from avp_habitat.simulators.habitat.installed import inspect_installation, require_installed
-from avp_habitat.versions import version_of
 
 LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"
 _OPEN_LIMIT_S = 120.0
 _TORCH_LIMIT_S = 60.0
 _COMPILED_LIMIT_S = 60.0
 # One of the suite's kernels stands for all.
-_COMPILED = "import json; from avp_habitat.map_kernel import draw as f; print(json.dumps(f.stats.cache_path))"
+_COMPILED = "import json; from avp_habitat.task.observations import draw as f; print(json.dumps(f.stats.cache_path))"
 _TORCH = (
     "import json, torch; there = torch.cuda.is_available(); "
     "print(json.dumps([torch.__version__, torch.version.cuda, torch.cuda.get_device_name() if there else None]))"

@@ -5,12 +5,11 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
 from avp_habitat.navigation.area import Float, NavigableArea, SurfaceBelow
-from avp_habitat.navigation.boundary import largest_piece, outline
 from avp_habitat.navigation.filters import standing_places
 from avp_habitat.navigation.heightfield import Heightfield, check_size, level_triangles, voxelise
 from avp_habitat.navigation.parts import Part, common_place, connected_parts, lay_flat, main_part, place_near
 from avp_habitat.navigation.settings import NavigationSettings
-from avp_habitat.navigation.walls import SKIN_M, Walls, are_inside, make_walls, off_walls
+from avp_habitat.navigation.walls import SKIN_M, Walls, are_inside, largest_piece, make_walls, off_walls, outline
 from avp_habitat.scenes.mesh import TexturedMesh
 
 _REACH_CELLS = 8

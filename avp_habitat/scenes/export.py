@@ -15,7 +15,7 @@ from avp_habitat.errors import SceneError, UsageError
 from avp_habitat.scenes.loader import load_scene
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.scenes.mesh import TexturedMesh
-from avp_habitat.simulators.options import add_up_option
+from avp_habitat.simulators.registry import add_up_option
 
 _UNLIT = "KHR_materials_unlit"
 _FLOAT, _UINT32 = 5126, 5125

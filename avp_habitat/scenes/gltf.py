@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles, check_memory, decode_picture
-from avp_habitat.scenes.gltf_buffers import Buffers, fractions
-from avp_habitat.scenes.gltf_materials import SUPPORTED, Surface, ignored, surface_of
+from avp_habitat.scenes.gltf_data import SUPPORTED, Buffers, Surface, fractions, ignored, surface_of
 from avp_habitat.scenes.masks import only, with_mask
-from avp_habitat.scenes.mesh import TexturedMesh, merge
-from avp_habitat.scenes.notices import say_once
+from avp_habitat.scenes.mesh import TexturedMesh, merge, say_once
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _REPEAT = 10497

@@ -8,8 +8,7 @@ from pathlib import Path
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles
 from avp_habitat.scenes.location import BUILTIN, Frame, SceneLocation, locate
-from avp_habitat.scenes.mesh import TexturedMesh
-from avp_habitat.scenes.notices import say_once
+from avp_habitat.scenes.mesh import TexturedMesh, say_once
 from avp_habitat.scenes.placing import check_numbers, looks_z_up, lost_mm, place
 from avp_habitat.scenes.stage_config import Y_UP
 
@@ -51,7 +50,7 @@ def load_scene(spec: str | Path, *, up: str | None = None, origin: Sequence[floa
 def load_located(location: SceneLocation, *, origin: Sequence[float] | None = None) -> Scene:
     """Load a scene that was located; arguments and errors as of `load_scene`."""
     if location.asset is None:
-        from avp_habitat.scenes.builtin import generate_room
+        from avp_habitat.scenes.builtin.room import generate_room
 
         return Scene(location.name, scene_digest(location), generate_room(_seed(location)))
     if location.objects:
@@ -75,7 +74,7 @@ def identify(location: SceneLocation) -> tuple[str, Frame]:
         SceneError: the mesh is damaged, or holds no triangle.
     """
     if location.asset is None:
-        from avp_habitat.scenes.builtin import GENERATOR_VERSION
+        from avp_habitat.scenes.builtin.room import GENERATOR_VERSION
 
         text = f"{BUILTIN}{_seed(location)}:v{GENERATOR_VERSION}"
         return hashlib.sha256(text.encode()).hexdigest(), Frame()

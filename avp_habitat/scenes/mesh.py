@@ -1,9 +1,24 @@
 """The triangle mesh that every scene becomes: positions, texture coordinates, colours and textures as arrays."""
 
+import logging
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+
+_log = logging.getLogger(__name__)
+
+
+@cache
+def say_once(scene: str, text: str) -> None:
+    """Log a warning about a scene, one line that Python shows on stderr, once in a process.
+
+    Args:
+        scene: the path as the user wrote it.
+        text: what was found, and what is done with it.
+    """
+    _log.warning("%s: %s", scene, text)
 
 
 @dataclass(frozen=True)

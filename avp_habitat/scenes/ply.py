@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles, decode_picture
-from avp_habitat.scenes.mesh import TexturedMesh
-from avp_habitat.scenes.notices import say_once
+from avp_habitat.scenes.mesh import TexturedMesh, say_once
 from avp_habitat.scenes.polygons import triangulate
 
 _CODES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.coverage import pairs_in_image
 from avp_habitat.poses import Intrinsics, pixel_directions
+from avp_habitat.sight.coverage import pairs_in_image
 from avp_habitat.simulators.base import Frames
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class RaycastSimulator:
         own = build_area(solid, self.surface_below)
         if self._navmesh is None:
             return own
-        from avp_habitat.navigation.islands import area_of_file
+        from avp_habitat.navigation.navmesh import area_of_file
 
         vertices = self._mesh.vertices[np.unique(self._mesh.triangles)]
         bounds = np.stack([vertices.min(axis=0), vertices.max(axis=0)]).astype(np.float64)

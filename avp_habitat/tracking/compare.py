@@ -13,14 +13,6 @@ from urllib.parse import urlsplit
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
 from avp_habitat.metrics import explained
-from avp_habitat.tracking.addresses import (
-    DEFAULT_ADDRESS,
-    TrackingError,
-    address_of,
-    connect,
-    first_line,
-    shown,
-)
 from avp_habitat.tracking.comparison import (
     KIND,
     KIND_TAG,
@@ -33,6 +25,7 @@ from avp_habitat.tracking.comparison import (
     picture,
 )
 from avp_habitat.tracking.experiments import DEFAULT_HELP, find_experiment, meant
+from avp_habitat.tracking.stores import DEFAULT_ADDRESS, TrackingError, address_of, connect, first_line, shown
 from avp_habitat.tracking.view import MODEL_TRAINING, prepare_experiment
 
 if TYPE_CHECKING:

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from avp_habitat.intervals import mean_and_half_width
-from avp_habitat.metrics import coverage_per_view
+from avp_habitat.metrics import coverage_per_view, mean_and_half_width
 from avp_habitat.tracking.view import run_colour
 
 if TYPE_CHECKING:

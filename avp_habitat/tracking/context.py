@@ -6,11 +6,10 @@ import sys
 
 from mlflow.tracking.context.abstract_context import RunContextProvider
 
-from avp_habitat.provenance import git_commit
-from avp_habitat.simulators import open_scenes
-from avp_habitat.versions import PACKAGES, installed_versions
+from avp_habitat.provenance import PACKAGES, git_commit, installed_versions
+from avp_habitat.simulators.registry import open_scenes
 
-_USERS = ("avp_habitat.env", "avp_sb3", "avp_nerfstudio")
+_USERS = ("avp_habitat.task.env", "avp_sb3", "avp_nerfstudio")
 _MAX_TAG = 5000
 
 

@@ -9,9 +9,9 @@ from tqdm import tqdm
 
 from avp_habitat import command
 from avp_habitat.errors import UsageError
-from avp_habitat.tracking.addresses import TrackingError, absolute, shown
 from avp_habitat.tracking.journal import SPOOL_VARIABLE, Journal, spool_folder
-from avp_habitat.tracking.recovery import Recovered, finish, left_journals
+from avp_habitat.tracking.opening import Recovered, finish, left_journals
+from avp_habitat.tracking.stores import TrackingError, absolute, shown
 
 # Somebody waits for this, and a server that has just been started takes long over its first answers.
 _PATIENCE_S = 120.0

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from avp_habitat.tracking.addresses import TrackingError, first_line
+from avp_habitat.tracking.stores import TrackingError, first_line
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

@@ -4,7 +4,7 @@ import os
 import time
 from typing import TYPE_CHECKING
 
-from avp_habitat.tracking.addresses import TrackingError, shown
+from avp_habitat.tracking.stores import TrackingError, shown
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

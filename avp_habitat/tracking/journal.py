@@ -20,6 +20,16 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+
+@contextmanager
+def alone(name: str) -> Iterator[None]:
+    """Wait until no other program of this user is within a block of the same name."""
+    with (Path(tempfile.gettempdir()) / f"avp-{os.getuid()}-{name}.lock").open("w") as file:
+        with suppress(OSError):  # A file system without locks.
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
 Entry = Mapping[str, Any]
 
 DEFAULT_SPOOL = Path("runs") / "mlflow-spool"

@@ -11,21 +11,21 @@ from typing import TYPE_CHECKING, Any
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
-from avp_habitat.rollout import read_rollout
+from avp_habitat.rollout.format import read_rollout
 from avp_habitat.tracking import rollout_facts as facts
-from avp_habitat.tracking.addresses import (
+from avp_habitat.tracking.experiments import DEFAULT_HELP, experiment_id, meant
+from avp_habitat.tracking.journal import alone
+from avp_habitat.tracking.names import PARENT_TAG, find_run
+from avp_habitat.tracking.stores import (
     DEFAULT_ADDRESS,
     TrackingError,
     address_of,
     connect,
     first_line,
+    how_to_look,
     shown,
     unreachable,
 )
-from avp_habitat.tracking.experiments import DEFAULT_HELP, experiment_id, meant
-from avp_habitat.tracking.locks import alone
-from avp_habitat.tracking.looking import how_to_look
-from avp_habitat.tracking.remote import PARENT_TAG, find_run
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

@@ -11,12 +11,11 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal
 from uuid import uuid4
 
-from avp_habitat.tracking.addresses import StoreUnreachableError, connect, is_missing, shown
 from avp_habitat.tracking.delivery import Delivery
 from avp_habitat.tracking.journal import Journal
-from avp_habitat.tracking.names import Names, safe_name
-from avp_habitat.tracking.remote import create, reopen
+from avp_habitat.tracking.names import Names, create, reopen, safe_name
 from avp_habitat.tracking.sender import INTERVAL_S, Sender
+from avp_habitat.tracking.stores import StoreUnreachableError, connect, is_missing, shown
 
 if TYPE_CHECKING:
     import numpy as np

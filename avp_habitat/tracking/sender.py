@@ -5,9 +5,9 @@ import threading
 import time
 from collections.abc import Callable
 
-from avp_habitat.tracking.addresses import StoreUnreachableError, first_line, shown, unreachable
 from avp_habitat.tracking.delivery import Delivery
 from avp_habitat.tracking.journal import Journal
+from avp_habitat.tracking.stores import StoreUnreachableError, first_line, shown, unreachable
 
 INTERVAL_S = 5.0
 """Time between two calls while a run lasts; each costs the training tens of milliseconds of Python."""

@@ -8,17 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from avp_habitat import command
+from avp_habitat.command import progress
 from avp_habitat.errors import AVPError, UsageError
-from avp_habitat.progress import progress
-from avp_habitat.rollout import Rollout
+from avp_habitat.rollout.format import Rollout
 from avp_habitat.scenes.loader import Scene, load_scene
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.scenes.location import UPS, locate
-from avp_habitat.simulators.options import add_up_option
+from avp_habitat.simulators.registry import add_up_option
 from avp_nerfstudio.check.outputs import choose_folder, outputs_of_geometry, write_outputs
 from avp_nerfstudio.check.shape import check_format
 from avp_nerfstudio.check.verdict import Verdict
-from avp_nerfstudio.foreign import check_is_rollout
+from avp_nerfstudio.data.foreign import check_is_rollout
 
 
 class CheckFailedError(AVPError):
@@ -94,8 +94,8 @@ def _pictures(rollout: Rollout, request: Request, proved: Any) -> list[Verdict]:
         return []
     try:
         from avp_nerfstudio.check.colmap import export_colmap
-        from avp_nerfstudio.check.pictures import check_pictures
-        from avp_nerfstudio.check.pictures_matching import match_pictures
+        from avp_nerfstudio.check.pictures.evidence import check_pictures
+        from avp_nerfstudio.check.pictures.matching import match_pictures
     except ImportError as error:
         raise MissingPackageError(
             f"checking the pictures needs {error.name}: pip install {error.name}, or leave it out with --no-pictures"

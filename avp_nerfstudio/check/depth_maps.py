@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.errors import RolloutError
-from avp_habitat.images import read_depth
 from avp_habitat.poses import Intrinsics, pixel_directions
-from avp_habitat.rollout import View
+from avp_habitat.rollout.format import View
+from avp_habitat.rollout.images import read_depth
 
 Float = NDArray[np.floating]
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.poses import Intrinsics, camera_to_world, habitat_to_opencv, yaw_and_pitch
-from avp_habitat.rollout import HELDOUT, Rollout, frame_name, read_rollout
-from avp_nerfstudio.check.registration import rotation_matrix
+from avp_habitat.rollout.format import HELDOUT, Rollout, frame_name, read_rollout
+from avp_nerfstudio.check.cloud import rotation_matrix
 
 Float = NDArray[np.floating]
 

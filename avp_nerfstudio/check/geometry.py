@@ -7,25 +7,23 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.rollout import Rollout
+from avp_habitat.rollout.format import Rollout
 from avp_habitat.scenes.loader import Scene
 from avp_nerfstudio.check import hypotheses
-from avp_nerfstudio.check.agreement import Agreement
-from avp_nerfstudio.check.comparison import (
+from avp_nerfstudio.check.agreement import (
     AGREEING_SHARE,
     AGREEING_SHARE_OF_FRAME,
     LEAST_COMPARED,
+    Agreement,
     Comparison,
     agrees,
     bad_frames,
     overlap,
 )
+from avp_nerfstudio.check.cloud import PARTNERS, Correction, mesh_distance, register
 from avp_nerfstudio.check.depth_maps import DepthMaps, load_depth_maps
-from avp_nerfstudio.check.frame_mistakes import frame_mistake
-from avp_nerfstudio.check.global_mistakes import Diagnosis, Walk, mistake_with_a_part, mistake_with_all
 from avp_nerfstudio.check.hypotheses import Cameras
-from avp_nerfstudio.check.mesh_distance import mesh_distance
-from avp_nerfstudio.check.registration import PARTNERS, Correction, register
+from avp_nerfstudio.check.mistakes import Diagnosis, Walk, frame_mistake, mistake_with_a_part, mistake_with_all
 from avp_nerfstudio.check.verdict import Verdict
 
 CORRECTION_M = 0.005

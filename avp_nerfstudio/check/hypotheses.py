@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.poses import Intrinsics, camera_to_world, opencv_to_habitat
-from avp_nerfstudio.check.upright import full_angles, has_no_roll
+from avp_nerfstudio.check.verdict import full_angles, has_no_roll
 
 Float = NDArray[np.floating]
 Mask = NDArray[np.bool_]

@@ -1,17 +1,155 @@
 """The format check: files, numbers and tables of a rollout agree with each other, and describe a walk."""
 
+import csv
 import json
 import struct
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from avp_habitat.errors import RolloutError
-from avp_habitat.rollout import Rollout, frame_name, read_json, read_rollout
-from avp_nerfstudio.check.verdict import Verdict
-from avp_nerfstudio.check.walk import cause_of_steps, impossible_steps, read_steps, table_fault, upright_fault
+from avp_habitat.poses import opencv_to_habitat, wrap_angle, yaw_and_pitch, z_up_to_y_up
+from avp_habitat.rollout.format import Rollout, frame_name, read_json, read_rollout
+from avp_nerfstudio.check.verdict import Verdict, has_no_roll, is_upright
+
+Float = NDArray[np.floating]
+
+STEP_M = 0.002
+"""Steps may be so much longer than a forward move; in correct rollouts they exceed it by less than 0.000002 m."""
+CLIMB_M, CLIMB_CELL_M = 0.2, 0.1
+"""What an agent can climb from one navigable cell to the next, and the side of a cell: a step may cross several."""
+ANGLE_RAD = 1e-4
+"""Turns may differ so much from their amount; in correct rollouts by less than 0.000001."""
+TABLE_M = 2e-4
+"""Positions in the table may differ so much from the poses (six decimals are written)."""
+
+
+@dataclass(frozen=True)
+class Steps:
+    """`steps.csv`, as far as poses can be held against it."""
+
+    action: list[str]
+    """Name of each step's action."""
+    position: Float
+    """`(n, 3)` the agent's feet, metres."""
+    yaw: Float
+    """`(n,)` radians."""
+    pitch: Float
+    """`(n,)` radians."""
+
+
+def read_steps(path: Path, count: int) -> Steps | None:
+    """Read the table, None where there is none or it is empty.
+
+    Raises:
+        RolloutError: it is unreadable, lacks columns, or has another number of rows than there are frames.
+    """
+    if not path.exists():
+        return None
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        if not rows:
+            return None
+        columns = np.array([[float(row[name]) for name in _COLUMNS] for row in rows])
+        actions = [str(row["action"]) for row in rows]
+    except KeyError as error:
+        raise RolloutError(f"{path}: expected a column {error.args[0]!r}, found none") from None
+    except (OSError, ValueError, TypeError) as error:
+        raise RolloutError(f"{path}: expected a table of numbers, could not read it: {error}") from None
+    if len(rows) != count:
+        raise RolloutError(f"{path}: expected {count} rows, one per frame, found {len(rows)}")
+    return Steps(actions, columns[:, :3], columns[:, 3], columns[:, 4])
+
+
+_COLUMNS = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad")
+
+
+def upright_fault(poses: Float, limit_deg: float, names: list[str]) -> tuple[str, str | None] | None:
+    """What is wrong with how `(n, 4, 4)` cameras stand, and why perhaps; None when all are upright."""
+    wrong = np.flatnonzero(~is_upright(poses, limit_deg=limit_deg))
+    if not len(wrong):
+        return None
+    worst = int(wrong[0])
+    if has_no_roll(poses[[worst]])[0]:
+        down = poses[worst, 1, 1] < 0
+        what = "upside down" if down else f"pitched beyond {limit_deg:g} degrees"
+    else:
+        what = "rolled to the side"
+    text = f"{len(wrong)} of {len(poses)} cameras do not stand upright, {names[worst]} is {what}"
+    transposed = poses.copy()
+    transposed[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
+    for cause, undone in (
+        ("camera axes look like opencv written as habitat: y and z flipped", opencv_to_habitat(poses)),
+        ("the world looks Z-up, as nerfstudio's is: expected Y up", z_up_to_y_up(poses)),
+        ("the rotations look transposed, or world_to_camera was written for camera_to_world", transposed),
+    ):
+        if is_upright(undone, limit_deg=limit_deg).all():
+            return text, cause
+    return text, None
+
+
+def table_fault(poses: Float, steps: Steps, height_m: float | None) -> str | None:
+    """How poses contradict the table of steps, None when they do not; `height_m` of the camera above the feet."""
+    raised = steps.position + np.array([0.0, height_m or 0.0, 0.0])
+    axes = [0, 1, 2] if height_m is not None else [0, 2]
+    away = np.abs(poses[:, :3, 3] - raised)[:, axes].max(axis=1)
+    if (worst := int(away.argmax())) >= 0 and away[worst] > TABLE_M:
+        return (
+            f"frame {worst} stands {1000 * away[worst]:.0f} mm from its position in steps.csv "
+            f"(camera {'height' if height_m is not None else 'without height'} included, limit {1000 * TABLE_M:g} mm)"
+        )
+    yaw, pitch = yaw_and_pitch(poses)
+    for name, difference in (("yaw", wrap_angle(yaw - steps.yaw)), ("pitch", pitch - steps.pitch)):
+        if np.abs(difference).max() > ANGLE_RAD:
+            worst = int(np.abs(difference).argmax())
+            return f"{name} of frame {worst} differs by {np.degrees(difference[worst]):.2f} degrees from steps.csv"
+    return None
+
+
+def impossible_steps(poses: Float, steps: Steps, actions: dict[str, Any]) -> dict[int, str]:
+    """Steps that an agent cannot have made, by the number of the frame that they lead to.
+
+    Args:
+        poses: `(n, 4, 4)` of the captured frames.
+        steps: for the actions.
+        actions: `rollout.json`'s entry of that name: forward_m, turn_deg, tilt_deg.
+    """
+    reach, turn, tilt = (float(actions[name]) for name in ("forward_m", "turn_deg", "tilt_deg"))
+    moved = np.diff(poses[:, :3, 3], axis=0)
+    length = np.linalg.norm(moved[:, [0, 2]], axis=1)
+    yaw, pitch = (np.degrees(np.asarray(angle)) for angle in yaw_and_pitch(poses))
+    turned, tilted = np.degrees(wrap_angle(np.radians(np.diff(yaw)))), np.diff(pitch)
+    found = {}
+    for index, action in enumerate(steps.action[1:]):
+        allowed = reach if action == "move_forward" else 0.0
+        wanted = {"turn_left": turn, "turn_right": -turn}.get(action, 0.0)
+        lift = {"look_up": tilt, "look_down": -tilt}.get(action, 0.0)
+        climbed = CLIMB_M * (length[index] / CLIMB_CELL_M + 1) if allowed else STEP_M
+        if length[index] > allowed + STEP_M or abs(moved[index, 1]) > climbed:
+            found[index + 1] = f"{action} of {np.linalg.norm(moved[index]):.3f} m (at most {allowed:g} m)"
+        elif abs(turned[index] - wanted) > np.degrees(ANGLE_RAD):
+            found[index + 1] = f"{action} that turned by {turned[index]:+.1f} degrees ({wanted:+g} expected)"
+        # At its limit the pitch stays.
+        elif abs(tilted[index] - lift) > np.degrees(ANGLE_RAD) and abs(tilted[index]) > np.degrees(ANGLE_RAD):
+            found[index + 1] = f"{action} that tilted by {tilted[index]:+.1f} degrees ({lift:+g} expected)"
+    return found
+
+
+def cause_of_steps(found: dict[int, str], count: int) -> str | None:
+    """Which single pose explains impossible steps: two in a row lead to and from it."""
+    frames = sorted(found)
+    if len(frames) == 2 and frames[1] == frames[0] + 1:
+        return f"the pose of frame {frames[0]} is off: the steps to it and from it are impossible"
+    if len(frames) == 1 and frames[0] in (1, count - 1):
+        frame = 0 if frames[0] == 1 else frames[0]
+        return f"the pose of frame {frame} is off: the step at that end of the walk is impossible"
+    return None
+
 
 NAME = "format"
 _FOCAL_SHARE = 1e-4

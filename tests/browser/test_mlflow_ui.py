@@ -20,7 +20,7 @@ import avp_sb3.evaluate
 from avp_habitat import command
 from avp_habitat.collect import Request, collect
 from avp_habitat.poses import Intrinsics
-from avp_habitat.settings import TaskSettings
+from avp_habitat.task.settings import TaskSettings
 from avp_habitat.tracking import compare
 from avp_habitat.tracking.comparison import COLUMNS, collect_runs, markdown
 from avp_habitat.tracking.comparison import compare as compare_runs

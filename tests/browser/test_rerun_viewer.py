@@ -16,7 +16,7 @@ from PIL import Image
 from tracking import ppo
 
 from avp_sb3 import RerunCallback
-from avp_sb3.rerun_live import program
+from avp_sb3.rerun.live import program
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -147,7 +147,7 @@ def test_a_pathfinder_without_a_navmesh_is_never_asked(run, tmp_path):
 DAMAGED = """
 import habitat_sim
 from avp_habitat.errors import SceneError
-from avp_habitat.navigation.navmesh_file import read_navmesh
+from avp_habitat.navigation.navmesh import read_navmesh
 from avp_habitat.navigation.settings import NavigationSettings
 
 engine = plain()
@@ -312,8 +312,8 @@ def test_triton_between_habitat_sim_and_the_simulator_is_an_error_of_ours(run):
 # --- the end of the process -------------------------------------------------------------------------------------------
 
 STEPPING = """
-from avp_habitat.env import AVPEnv
-from avp_habitat.simulators import make_simulator
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.simulators.registry import make_simulator
 
 env = AVPEnv(simulator=make_simulator("habitat", room), budget=30_000, width=64, height=48)
 env.reset(seed=0)

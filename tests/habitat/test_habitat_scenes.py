@@ -16,16 +16,16 @@ import trimesh
 from replica_layout import DATASET, replica_layout, write_quads
 from shapes import RAMP, furnished, mesh_of, ramp, roofed, small_dataset, storeys, write_json, write_room
 
-from avp_habitat.coverage import candidates
-from avp_habitat.env import AVPEnv
 from avp_habitat.errors import SceneError
 from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.poses import Intrinsics, camera_to_world
-from avp_habitat.rollout import read_rollout
-from avp_habitat.scenes.builtin import generate_room
+from avp_habitat.rollout.format import read_rollout
+from avp_habitat.scenes.builtin.room import generate_room
 from avp_habitat.scenes.loader import load_scene
 from avp_habitat.scenes.mesh import TexturedMesh
+from avp_habitat.sight.coverage import candidates
 from avp_habitat.simulators.raycast import RaycastSimulator
+from avp_habitat.task.env import AVPEnv
 
 pytestmark = pytest.mark.habitat
 

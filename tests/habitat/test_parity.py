@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avp_habitat.coverage import candidates
-from avp_habitat.env import AVPEnv
-from avp_habitat.heldout import heldout_poses
-from avp_habitat.settings import TaskSettings
-from avp_habitat.simulators import make_simulator
+from avp_habitat.rollout.capture import heldout_poses
+from avp_habitat.sight.coverage import candidates
+from avp_habitat.simulators.registry import make_simulator
+from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.settings import TaskSettings
 
 pytestmark = pytest.mark.habitat
 

@@ -5,10 +5,10 @@ import gc
 import numpy as np
 import pytest
 
-from avp_habitat.env import AVPEnv
 from avp_habitat.errors import SimulatorError
 from avp_habitat.poses import Intrinsics
-from avp_habitat.simulators import make_simulator
+from avp_habitat.simulators.registry import make_simulator
+from avp_habitat.task.env import AVPEnv
 
 pytestmark = pytest.mark.habitat
 

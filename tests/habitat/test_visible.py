@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from shapes import furnished, mesh_of, write_room
 
-from avp_habitat.agent_view import agent_views
-from avp_habitat.env import AVPEnv
-from avp_habitat.lookup.sight import reached_around
-from avp_habitat.oracle.lattice import lattice_of, unpack
-from avp_habitat.oracle.policy import OraclePolicy, SurveyPolicy
-from avp_habitat.oracle.search import BeamSettings
+from avp_habitat.policies.oracle.lattice import lattice_of, unpack
+from avp_habitat.policies.oracle.policy import OraclePolicy, SurveyPolicy
+from avp_habitat.policies.oracle.search import BeamSettings
 from avp_habitat.poses import Intrinsics, camera_to_world
 from avp_habitat.scenes.loader import Scene
+from avp_habitat.sight.tables import reached_around
 from avp_habitat.simulators.base import SingleRays
 from avp_habitat.simulators.habitat import HabitatSimulator
 from avp_habitat.simulators.raycast import RaycastSimulator
+from avp_habitat.task.agent_view import agent_views
+from avp_habitat.task.env import AVPEnv
 
 ROOM = np.array([[-3, 0, -2], [3, 2.8, 2]], float)
 CUPBOARD = np.array([[0.5, 0, -2], [2, 1.9, -0.8]])
@@ -145,7 +145,7 @@ def test_places_reach_points_in_every_direction(simulator):
 def test_planners_that_know_the_scene_plan_in_either(simulator, monkeypatch):
     """The lattice is that of the geometry; what is planned is what the episode then counts."""
     if not isinstance(simulator, SingleRays):  # It looks around with pictures, each of whose pixels costs a ray here.
-        monkeypatch.setattr("avp_habitat.oracle.lattice._PANORAMAS", 12)
+        monkeypatch.setattr("avp_habitat.policies.oracle.lattice._PANORAMAS", 12)
     env = AVPEnv(simulator=simulator, budget=12, reward="coverage", width=32, height=24)
     lattice = lattice_of(simulator, env.settings)
     sees = unpack(lattice.sees, len(lattice.points))

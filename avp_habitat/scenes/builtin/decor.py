@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from avp_habitat.scenes.builtin.dice import Dice
-from avp_habitat.scenes.builtin.kit import Kit
-from avp_habitat.scenes.builtin.piece import Lamp, Piece
+from avp_habitat.scenes.builtin.kit import Kit, Lamp, Piece
+from avp_habitat.scenes.builtin.random import Dice
 from avp_habitat.scenes.builtin.shapes import Surface, box, cylinder, lathe, sheet
 
 

@@ -4,10 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
-from avp_habitat.scenes.builtin import decor, seating, storage, tables
-from avp_habitat.scenes.builtin.dice import Dice
-from avp_habitat.scenes.builtin.kit import Kit
-from avp_habitat.scenes.builtin.piece import Piece, shifted
+from avp_habitat.scenes.builtin import decor, seating, storage
+from avp_habitat.scenes.builtin.kit import Kit, Piece, shifted
+from avp_habitat.scenes.builtin.random import Dice
 from avp_habitat.scenes.builtin.shapes import Material, Rectangle, Surface, box, yawed
 
 GAP_M = 0.03
@@ -55,8 +54,8 @@ def against_wall(piece: Piece, clear: float) -> Arrange:
 def living(kit: Kit, dice: Dice) -> list[Arrange]:
     """A television and a sofa that faces it over a coffee table on a rug; the fullest arrangement comes first."""
     unit, couch = storage.television(kit, dice), seating.sofa(kit, dice)
-    table, carpet = tables.coffee_table(kit, dice), decor.rug(kit, 2.3, 1.6)
-    seat, beside, lamp = seating.armchair(kit, dice), tables.side_table(kit, dice), decor.floor_lamp(kit, dice)
+    table, carpet = seating.coffee_table(kit, dice), decor.rug(kit, 2.3, 1.6)
+    seat, beside, lamp = seating.armchair(kit, dice), seating.side_table(kit, dice), decor.floor_lamp(kit, dice)
     side, twist = dice.pick((-1, 1)), dice.number(-0.2, 0.2)
     free = dice.number(3.3, 3.8)
 
@@ -91,14 +90,14 @@ def dining(kit: Kit, dice: Dice) -> Arrange:
     members: list[Member] = []
     if dice.chance(0.35):
         radius = dice.number(0.5, 0.6)
-        table = tables.round_table(kit, dice, radius)
+        table = seating.round_table(kit, dice, radius)
         half_x = half_z = radius + 0.32
         for quarter, (x, z) in enumerate(((0, -1), (-1, 0), (0, 1), (1, 0))):
             one = seating.chair(kit, dice, wood)
             members.append(Member(one, x * half_x, z * half_z, (0, 1, 2, 3)[quarter], dice.number(-0.12, 0.12)))
     else:
         pairs = dice.pick((2, 2, 3))
-        table = tables.dining_table(kit, dice, 0.62 * pairs + 0.2, 0.85)
+        table = seating.dining_table(kit, dice, 0.62 * pairs + 0.2, 0.85)
         half_x, half_z = table.width / 2, table.depth / 2 + 0.3
         for index in range(pairs):
             x = (index - (pairs - 1) / 2) * 0.62
@@ -117,7 +116,7 @@ def dining(kit: Kit, dice: Dice) -> Arrange:
 def sleeping(kit: Kit, dice: Dice) -> Arrange:
     """A bed with its head to the wall, one or two night stands and a rug beside it."""
     couch = seating.bed(kit, dice)
-    stands = [tables.side_table(kit, dice) for _ in range(2)]
+    stands = [seating.side_table(kit, dice) for _ in range(2)]
     z = GAP_M + couch.depth / 2
     members = [Member(couch, 0.0, z)]
     sides = (-1, 1) if couch.width > 1.2 else (dice.pick((-1, 1)),)
@@ -132,7 +131,7 @@ def sleeping(kit: Kit, dice: Dice) -> Arrange:
 
 def working(kit: Kit, dice: Dice) -> Arrange:
     """A desk against the wall and a swivel chair before it."""
-    table, stool = tables.desk(kit, dice), seating.office_chair(kit, dice)
+    table, stool = seating.desk(kit, dice), seating.office_chair(kit, dice)
     z = GAP_M + table.depth / 2
     group = Group(
         (Member(table, 0.0, z), Member(stool, -0.1, GAP_M + table.depth + 0.42, 2, dice.number(-0.4, 0.4))),

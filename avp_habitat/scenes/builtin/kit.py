@@ -4,10 +4,48 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
-from avp_habitat.scenes.builtin import finishes, pictures, textiles
-from avp_habitat.scenes.builtin.dice import Dice
-from avp_habitat.scenes.builtin.noise import Colour, blend, shade
-from avp_habitat.scenes.builtin.shapes import Material
+import numpy as np
+
+from avp_habitat.scenes.builtin import finishes, pictures, textures
+from avp_habitat.scenes.builtin.random import Dice
+from avp_habitat.scenes.builtin.shapes import Material, Surface, Vector, moved
+from avp_habitat.scenes.builtin.textures import Colour, blend, shade
+
+FLAT_M = 0.02
+"""Pieces no higher than this lie on the floor without being in the way."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lamp:
+    """A point from which warm light comes."""
+
+    position: Vector
+    """Metres, in the frame of what holds it."""
+    strength: float
+    """Light one metre away, where 1 is the light that shows colours as they are painted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Furniture in its own frame: foot at the origin, y up, front towards +z, width along x."""
+
+    kind: str
+    """For example `"sofa"`."""
+    surfaces: list[Surface]
+    """Its triangles."""
+    width: float
+    """Extent along x in metres, centred."""
+    depth: float
+    """Extent along z in metres, centred."""
+    height: float
+    """Extent along y in metres."""
+    lamps: tuple[Lamp, ...] = ()
+    """Lights in it."""
+
+
+def shifted(surfaces: list[Surface], x: float, y: float, z: float) -> list[Surface]:
+    """The same surfaces elsewhere, metres."""
+    return moved(surfaces, np.eye(3), np.array([x, y, z]))
 
 
 @dataclass(frozen=True)
@@ -146,14 +184,14 @@ class Kit:
         """Coarse cloth of the sofa."""
         colour = self.scheme.upholstery
         return Material(
-            partial(textiles.weave, self._dice(9), shade(colour, 1.1), blend(colour, (1, 1, 1), 0.5)), 0.6, 0.6
+            partial(textures.weave, self._dice(9), shade(colour, 1.1), blend(colour, (1, 1, 1), 0.5)), 0.6, 0.6
         )
 
     @cached_property
     def second_cloth(self) -> Material:
         """Coarse cloth of armchairs and chairs."""
         colour = self.scheme.accents[self._dice(10).whole(0, 1)]
-        return Material(partial(textiles.weave, self._dice(10), shade(colour, 1.05), shade(colour, 0.6)), 0.6, 0.6)
+        return Material(partial(textures.weave, self._dice(10), shade(colour, 1.05), shade(colour, 0.6)), 0.6, 0.6)
 
     @cached_property
     def cushions(self) -> list[Material]:
@@ -162,7 +200,7 @@ class Kit:
         for index in range(3):
             dice = self._dice(20 + index)
             first, second, third = dice.shuffled([*self.scheme.accents])
-            made.append(Material(partial(textiles.printed, dice, (first, second, third)), 0.5, 0.5))
+            made.append(Material(partial(textures.printed, dice, (first, second, third)), 0.5, 0.5))
         return made
 
     @cached_property
@@ -170,20 +208,20 @@ class Kit:
         """Printed cloth of the curtains."""
         dice, accents = self._dice(30), self.scheme.accents
         ground = blend(accents[2], (0.95, 0.93, 0.9), 0.5)
-        return Material(partial(textiles.printed, dice, (ground, accents[0], accents[1])), 0.7, 0.7)
+        return Material(partial(textures.printed, dice, (ground, accents[0], accents[1])), 0.7, 0.7)
 
     @cached_property
     def bedding(self) -> Material:
         """The quilt."""
         first, second, third = self._dice(31).shuffled([*self.scheme.accents])
         return Material(
-            partial(textiles.bedding, self._dice(31), (blend(first, (1, 1, 1), 0.4), second, third)), 1.2, 1.2
+            partial(textures.bedding, self._dice(31), (blend(first, (1, 1, 1), 0.4), second, third)), 1.2, 1.2
         )
 
     @cached_property
     def linen(self) -> Material:
         """Light cloth of mattress and pillows."""
-        return Material(partial(textiles.weave, self._dice(32), (0.93, 0.91, 0.87), (0.75, 0.77, 0.82)), 0.6, 0.6)
+        return Material(partial(textures.weave, self._dice(32), (0.93, 0.91, 0.87), (0.75, 0.77, 0.82)), 0.6, 0.6)
 
     @cached_property
     def metal(self) -> Material:
@@ -234,7 +272,7 @@ class Kit:
     @cached_property
     def lampshade(self) -> Material:
         """Cloth that is lit from behind."""
-        cloth = partial(textiles.weave, self._dice(54), (0.99, 0.91, 0.74), (0.9, 0.78, 0.56))
+        cloth = partial(textures.weave, self._dice(54), (0.99, 0.91, 0.74), (0.9, 0.78, 0.56))
         return Material(cloth, 0.4, 0.4, glows=True)
 
     @cached_property
@@ -269,4 +307,4 @@ class Kit:
 
     def rug(self, width_m: float, depth_m: float) -> Material:
         """Another rug of the given size in metres."""
-        return self._unique(lambda dice: textiles.rug(dice, dice.shuffled(self.colours), width_m, depth_m))
+        return self._unique(lambda dice: textures.rug(dice, dice.shuffled(self.colours), width_m, depth_m))

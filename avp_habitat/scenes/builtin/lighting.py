@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.scenes.builtin.piece import Lamp
+from avp_habitat.scenes.builtin.kit import Lamp
 from avp_habitat.scenes.builtin.shapes import Surface
 from avp_habitat.scenes.builtin.shell import Shell
 

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.scenes.builtin.dice import Dice
-from avp_habitat.scenes.builtin.noise import (
+from avp_habitat.scenes.builtin.random import Dice
+from avp_habitat.scenes.builtin.textures import (
     Colour,
     Field,
     blend,

@@ -1,9 +1,9 @@
-"""Furniture to sit and lie on: sofa, armchair, chairs, pouf, bed."""
+"""Tables and what stands on them."""
 
-from avp_habitat.scenes.builtin.dice import Dice
-from avp_habitat.scenes.builtin.kit import Kit
-from avp_habitat.scenes.builtin.piece import Piece, shifted
-from avp_habitat.scenes.builtin.shapes import Material, Surface, box, cushion, cylinder, leaned, yawed
+from avp_habitat.scenes.builtin.kit import Kit, Lamp, Piece, shifted
+from avp_habitat.scenes.builtin.pictures import SPINES, spine_cell
+from avp_habitat.scenes.builtin.random import Dice
+from avp_habitat.scenes.builtin.shapes import Material, Surface, box, cushion, cylinder, lathe, leaned, yawed
 
 SEAT_M = 0.46
 """Seats are higher than an agent with quantised steps of 0.2 m can climb."""
@@ -110,3 +110,141 @@ def bed(kit: Kit, dice: Dice) -> Piece:
         made += cushion((0.62, 0.13, 0.4), (x, 0.57, -depth / 2 + 0.34), 0.06, kit.linen, puff=0.03)
     made += _pillow(kit, dice, 0.0, 0.62, -depth / 2 + 0.62, -0.95)
     return Piece("bed", made, width, depth, high)
+
+
+def vase(kit: Kit, dice: Dice, high: float) -> list[Surface]:
+    """A bellied vase, its foot at the origin, metres."""
+    belly = high * dice.number(0.26, 0.36)
+    profile = [
+        (belly * 0.45, high), (belly * 0.5, high * 0.92), (belly * 0.36, high * 0.8), (belly * 0.8, high * 0.6),
+        (belly, high * 0.36), (belly * 0.8, high * 0.12), (belly * 0.55, 0.0),
+    ]  # fmt: skip
+    return lathe([(0.002, high * 0.94), *profile], (0, 0, 0), dice.pick(kit.ceramics), segments=12)
+
+
+def bowl(kit: Kit, dice: Dice) -> list[Surface]:
+    """A bowl with fruit, its foot at the origin."""
+    profile = [(0.001, 0.03), (0.09, 0.05), (0.14, 0.09), (0.145, 0.09), (0.1, 0.03), (0.06, 0.0)]
+    made = lathe(profile, (0, 0, 0), dice.pick(kit.ceramics), segments=14)
+    for x, z in ((-0.04, 0.02), (0.045, 0.03), (0.0, -0.05)):
+        made += lathe(
+            [(0.001, 0.075), (0.03, 0.065), (0.04, 0.04), (0.03, 0.012), (0.001, 0.004)], (x, 0.045, z),
+            dice.pick(kit.cushions), segments=8,
+        )  # fmt: skip
+    return made
+
+
+def book_stack(kit: Kit, dice: Dice) -> list[Surface]:
+    """A few books lying on each other, foot at the origin."""
+    made, y = [], 0.0
+    for _ in range(dice.whole(2, 4)):
+        thick = dice.number(0.02, 0.04)
+        one = box((0.23, thick, 0.16), (0, 0, 0), kit.books, fit=spine_cell(dice.whole(0, SPINES - 1)), pitch=1)
+        made += shifted(yawed(one, dice.number(-0.3, 0.3)), 0, y + thick / 2, 0)
+        y += thick + 0.001
+    return made
+
+
+def table_lamp(kit: Kit, dice: Dice) -> list[Surface]:
+    """A small lamp, its foot at the origin, 0.46 m high."""
+    made = lathe(
+        [(0.012, 0.3), (0.02, 0.24), (0.06, 0.16), (0.075, 0.09), (0.05, 0.02), (0.06, 0.0)], (0, 0, 0),
+        dice.pick(kit.ceramics), segments=10,
+    )  # fmt: skip
+    return made + lathe([(0.09, 0.46), (0.15, 0.26)], (0, 0, 0), kit.lampshade, segments=14, open_ended=True)
+
+
+def coffee_table(kit: Kit, dice: Dice) -> Piece:
+    """A low table, round or rectangular, with books and a bowl."""
+    high = 0.45
+    if dice.chance(0.35):
+        radius = dice.number(0.38, 0.46)
+        top = kit.stone if dice.chance(0.5) else kit.wood
+        made = cylinder(radius, high - 0.04, high, (0, 0, 0), top, 24)
+        made += cylinder(0.05, 0.03, high - 0.04, (0, 0, 0), kit.metal, 10)
+        made += cylinder(radius * 0.6, 0.0, 0.03, (0, 0, 0), kit.metal, 18)
+        width = depth = 2 * radius
+    else:
+        width, depth = dice.number(0.9, 1.15), dice.number(0.5, 0.6)
+        made = box((width, 0.04, depth), (0, high - 0.02, 0), kit.wood)
+        made += shifted(_legs(width - 0.06, depth - 0.06, high - 0.04, 0.05, kit.dark_wood), 0, 0, 0)
+        made += box((width - 0.1, 0.02, depth - 0.1), (0, 0.16, 0), kit.wood, pitch=0.5)
+        made += shifted(book_stack(kit, dice), -width * 0.2, 0.171, 0)
+    made += shifted(book_stack(kit, dice), -width * 0.22, high + 0.001, 0.02)
+    made += shifted(bowl(kit, dice) if dice.chance(0.6) else vase(kit, dice, 0.26), width * 0.2, high + 0.001, -0.03)
+    return Piece("coffee table", made, width, depth, high + 0.27)
+
+
+def dining_table(kit: Kit, dice: Dice, width: float, depth: float) -> Piece:
+    """A table to eat at, with a runner, plates and a vase."""
+    high = 0.75
+    made = box((width, 0.04, depth), (0, high - 0.02, 0), kit.wood, pitch=0.3)
+    made += box((width - 0.14, 0.08, depth - 0.14), (0, high - 0.08, 0), kit.wood, pitch=0.5)
+    made += _legs(width - 0.08, depth - 0.08, high - 0.04, 0.07, kit.dark_wood)
+    made += box((width * 0.7, 0.006, 0.32), (0, high + 0.003, 0), dice.pick(kit.cushions), pitch=0.3)
+    made += shifted(vase(kit, dice, dice.number(0.24, 0.36)), 0.05, high + 0.007, 0.0)
+    made += shifted(bowl(kit, dice), -width * 0.22, high + 0.007, 0.0)
+    plate = [(0.001, 0.012), (0.08, 0.012), (0.125, 0.024), (0.12, 0.016), (0.07, 0.0)]
+    for x in (-width * 0.25, width * 0.25):
+        for z in (-depth * 0.33, depth * 0.33):
+            made += lathe(plate, (x, high + 0.001, z), kit.ceramics[2], segments=16)
+    return Piece("dining table", made, width, depth, high + 0.37)
+
+
+def round_table(kit: Kit, dice: Dice, radius: float) -> Piece:
+    """A round dining table on one foot."""
+    high = 0.75
+    made = cylinder(radius, high - 0.035, high, (0, 0, 0), kit.stone if dice.chance(0.4) else kit.wood, 28)
+    foot = [(0.06, high - 0.035), (0.05, 0.5), (0.07, 0.25), (0.05, 0.1), (0.24, 0.03), (0.25, 0.0)]
+    made += lathe(foot, (0, 0, 0), kit.dark_wood, segments=14)
+    made += shifted(vase(kit, dice, 0.3), 0, high + 0.001, 0)
+    made += shifted(book_stack(kit, dice), radius * 0.5, high + 0.001, radius * 0.3)
+    return Piece("dining table", made, 2 * radius, 2 * radius, high + 0.3)
+
+
+def desk(kit: Kit, dice: Dice) -> Piece:
+    """A desk with drawers, a screen, a keyboard, a lamp and books; the user sits at the front."""
+    width, depth, high = dice.number(1.2, 1.5), 0.65, 0.74
+    made = box((width, 0.035, depth), (0, high - 0.0175, 0), kit.wood)
+    made += box((0.4, 0.5, depth - 0.06), (width / 2 - 0.22, high - 0.29, 0), kit.trim)
+    for place in (0.27, 0.43, 0.59):
+        made += box((0.36, 0.145, 0.012), (width / 2 - 0.22, place + 0.04, depth / 2 - 0.024), kit.wood, pitch=1)
+        made += box((0.12, 0.012, 0.02), (width / 2 - 0.22, place + 0.07, depth / 2 - 0.012), kit.metal, pitch=1)
+    for x, z in (
+        (-width / 2 + 0.05, -0.28),
+        (-width / 2 + 0.05, 0.28),
+        (width / 2 - 0.05, -0.28),
+        (width / 2 - 0.05, 0.28),
+    ):
+        made += box((0.05, high - 0.035, 0.05), (x, (high - 0.035) / 2, z), kit.dark_wood, pitch=1)
+    made += box((0.24, 0.012, 0.18), (-0.08, high + 0.007, -0.14), kit.black, pitch=1)
+    made += box((0.05, 0.2, 0.03), (-0.08, high + 0.1, -0.17), kit.black, pitch=1)
+    made += box((0.62, 0.37, 0.03), (-0.08, high + 0.31, -0.15), kit.black, pitch=1)
+    made += box(
+        (0.59, 0.34, 0.004), (-0.08, high + 0.31, -0.131), kit.screen, faces=("front",), fit=(0, 0, 1, 1), pitch=1
+    )
+    made += box((0.42, 0.02, 0.14), (-0.08, high + 0.011, 0.14), kit.keys, fit=(0, 0, 1, 1), pitch=1)
+    made += shifted(table_lamp(kit, dice), width / 2 - 0.2, high + 0.001, -0.12)
+    made += shifted(book_stack(kit, dice), -width / 2 + 0.17, high + 0.001, 0.05)
+    return Piece("desk", made, width, depth, 1.25, (Lamp((width / 2 - 0.2, 1.05, 0.0), 0.12),))
+
+
+def side_table(kit: Kit, dice: Dice) -> Piece:
+    """A small table or night stand with a lamp or a vase."""
+    side, high = 0.44, dice.number(0.5, 0.58)
+    if dice.chance(0.5):
+        made = cylinder(side / 2, high - 0.03, high, (0, 0, 0), kit.wood, 20)
+        made += shifted(_legs(0.3, 0.3, high - 0.03, 0.03, kit.dark_wood), 0, 0, 0)
+    else:
+        made = box((side, high - 0.12, side), (0, 0.12 + (high - 0.12) / 2, 0), kit.wood)
+        made += _legs(side - 0.04, side - 0.04, 0.12, 0.04, kit.dark_wood)
+        made += box(
+            (side - 0.06, high - 0.2, 0.012), (0, 0.12 + (high - 0.12) / 2, side / 2 + 0.006), kit.dark_wood, pitch=1
+        )
+        made += box((0.03, 0.03, 0.02), (0, high - 0.14, side / 2 + 0.02), kit.metal, pitch=1)
+    if dice.chance(0.65):
+        made += shifted(table_lamp(kit, dice), -0.04, high + 0.001, -0.05)
+        return Piece("side table", made, side, side + 0.06, high + 0.47, (Lamp((0.0, high + 0.4, 0.1), 0.16),))
+    made += shifted(vase(kit, dice, 0.3), -0.06, high + 0.001, -0.05)
+    made += shifted(book_stack(kit, dice), 0.06, high + 0.001, 0.1)
+    return Piece("side table", made, side, side + 0.06, high + 0.31)

@@ -1,11 +1,10 @@
 """Furniture to keep things in: shelves with books, wardrobe, drawers, television unit."""
 
-from avp_habitat.scenes.builtin.dice import Dice
-from avp_habitat.scenes.builtin.kit import Kit
+from avp_habitat.scenes.builtin.kit import Kit, Piece, shifted
 from avp_habitat.scenes.builtin.pictures import SPINES, spine_cell
-from avp_habitat.scenes.builtin.piece import Piece, shifted
+from avp_habitat.scenes.builtin.random import Dice
+from avp_habitat.scenes.builtin.seating import book_stack, bowl, vase
 from avp_habitat.scenes.builtin.shapes import Surface, box, yawed
-from avp_habitat.scenes.builtin.tables import book_stack, bowl, vase
 
 
 def _row_of_books(kit: Kit, dice: Dice, width: float, clear: float, depth: float) -> list[Surface]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from avp_habitat.errors import SimulatorError
-from avp_habitat.versions import version_of
+from avp_habitat.provenance import version_of
 
 HOW_TO_GET = (
     "habitat-sim is not installed, and the package index has none; build version 0.3.4 from its sources "

@@ -1,0 +1,259 @@
+"""How well what the frames have seen predicts the reconstruction: points, and their rank correlations."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from avp_experiment.stored import Key, Results
+from avp_habitat.metrics import CONFIDENCE, mean_and_half_width
+
+RESAMPLES = 2000
+_BOOTSTRAP_SEED = 0
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A mean over seeds with its 95 % confidence interval."""
+
+    mean: float
+    """Over seeds; each counts with its mean over scenes and starts."""
+    half_width: float
+    """Of the interval (Student's t over seeds); nan for one seed."""
+    seeds: int
+    """How many."""
+
+    @property
+    def low(self) -> float:
+        """Lower end of the interval; nan for one seed."""
+        return self.mean - self.half_width
+
+    @property
+    def high(self) -> float:
+        """Upper end of the interval; nan for one seed."""
+        return self.mean + self.half_width
+
+    def text(self, *, digits: int, scale: float = 1.0, sign: bool = False, unit: str = "") -> str:
+        """Mean ± half the interval, without ± for one seed."""
+        shown = f"{scale * self.mean:{'+' if sign else ''}.{digits}f}"
+        shown += "" if np.isnan(self.half_width) else f" ± {abs(scale) * self.half_width:.{digits}f}"
+        return f"{shown} {unit}".rstrip()
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Spearman's rank correlation ρ with a bootstrap interval."""
+
+    rho: float
+    """Within [-1, 1]."""
+    low: float
+    """Lower end of the 95 % interval; nan where there is one rollout only."""
+    high: float
+    """Upper end."""
+    points: int
+    """Reconstructions."""
+    rollouts: int
+    """That they were made of; what the bootstrap draws."""
+
+    def text(self) -> str:
+        """As ρ = 0.91 [0.85, 0.95]."""
+        interval = "" if np.isnan(self.low) else f" [{self.low:.2f}, {self.high:.2f}]"
+        return f"ρ = {self.rho:.2f}{interval}"
+
+
+def per_seed(values: Mapping[Key, float]) -> dict[int, float]:
+    """Means over scenes and starts by seed, in the seeds' order."""
+    found: dict[int, list[float]] = defaultdict(list)
+    for (_, seed, _), value in values.items():
+        found[seed].append(value)
+    return {seed: float(np.mean(found[seed])) for seed in sorted(found)}
+
+
+def summary(values: Mapping[Key, float]) -> Summary | None:
+    """Mean over seeds of a figure by episode; None without any."""
+    return of_seeds(list(per_seed(values).values()))
+
+
+def of_seeds(values: Sequence[float]) -> Summary | None:
+    """Mean over seeds of a figure by seed; None without any."""
+    if not values:
+        return None
+    mean, half = mean_and_half_width(values)
+    return Summary(float(mean), float(half), len(values))
+
+
+def paired(left: Mapping[Key, float], right: Mapping[Key, float]) -> Summary | None:
+    """Left minus right, over the episodes that both have; None where they have none in common."""
+    return summary({key: left[key] - right[key] for key in left if key in right})
+
+
+def saved_share(less: Mapping[Key, float], more: Mapping[Key, float]) -> Summary | None:
+    """By how much `less` lies below `more`, as a share of `more`: of the means of each seed over common episodes."""
+    common = [key for key in less if key in more]
+    first, second = per_seed({key: less[key] for key in common}), per_seed({key: more[key] for key in common})
+    return of_seeds([1 - first[seed] / second[seed] for seed in first])
+
+
+def at_views(curve: Mapping[int, float], views: float) -> float | None:
+    """A figure at a number of views, linear between the measured ones; None outside of them.
+
+    Args:
+        curve: by number of views, ascending.
+        views: asked for.
+    """
+    measured = list(curve)
+    if not measured or not measured[0] <= views <= measured[-1]:
+        return None
+    return float(np.interp(views, measured, list(curve.values())))
+
+
+def views_to_reach(curve: Mapping[int, float], target: float) -> float | None:
+    """The least number of views at which a figure reaches a target, linear between measured ones; None for never.
+
+    Args:
+        curve: by number of views, ascending. A target that the first one has reached is answered with that one.
+        target: of the figure.
+    """
+    before: tuple[int, float] | None = None
+    for views, value in curve.items():
+        if value >= target:
+            if before is None:
+                return float(views)
+            share = (target - before[1]) / (value - before[1])
+            return before[0] + share * (views - before[0])
+        before = (views, value)
+    return None
+
+
+def spearman(x: ArrayLike, y: ArrayLike, rollout: Sequence[object]) -> Correlation | None:
+    """Spearman's ρ over reconstructions; its interval draws rollouts, as those of one rollout are not independent.
+
+    Args:
+        x: `(n,)`.
+        y: `(n,)`.
+        rollout: `(n,)` which one each point belongs to.
+
+    Returns:
+        None for fewer than three points, or where one of the two does not vary.
+    """
+    x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
+        return None
+    names = {name: number for number, name in enumerate(dict.fromkeys(rollout))}
+    member = np.array([names[name] for name in rollout])
+    low, high = _bootstrap(x, y, member, len(names)) if len(names) > 1 else (np.nan, np.nan)
+    return Correlation(float(_rho(x, y, np.ones((1, len(x))))[0]), low, high, len(x), len(names))
+
+
+def _bootstrap(x: NDArray, y: NDArray, member: NDArray, rollouts: int) -> tuple[float, float]:
+    """Percentile interval over draws of whole rollouts; a rollout drawn k times counts k times."""
+    rng = np.random.default_rng(_BOOTSTRAP_SEED)
+    times = rng.multinomial(rollouts, np.full(rollouts, 1 / rollouts), size=RESAMPLES)
+    found = _rho(x, y, times[:, member].astype(np.float64))
+    found = found[np.isfinite(found)]
+    if not len(found):
+        return np.nan, np.nan
+    low, high = np.quantile(found, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(low), float(high)
+
+
+def _rho(x: NDArray, y: NDArray, times: NDArray) -> NDArray:
+    """`(r,)` ρ of `(n,)` points that count `(r, n)` times; nan where one of the two does not vary."""
+    ranks = [_ranks(values, times) for values in (x, y)]
+    total = times.sum(axis=1, keepdims=True)
+    first, second = (rank - (times * rank).sum(axis=1, keepdims=True) / total for rank in ranks)
+    products = [
+        (times * left * right).sum(axis=1) for left, right in ((first, second), (first, first), (second, second))
+    ]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return products[0] / np.sqrt(products[1] * products[2])
+
+
+def _ranks(values: NDArray, times: NDArray) -> NDArray:
+    """`(r, n)` ranks of `(n,)` values that count `(r, n)` times; equal values share their mean rank."""
+    _, place = np.unique(values, return_inverse=True)
+    order = np.argsort(place, kind="stable")
+    starts = np.flatnonzero(np.diff(place[order], prepend=-1))
+    together = np.add.reduceat(times[:, order], starts, axis=1)
+    return (np.cumsum(together, axis=1) - together / 2)[:, place]
+
+
+POINT_NAMES = ("visibility", "coverage")
+"""What may predict PSNR."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One reconstruction."""
+
+    method: str
+    """That took its views."""
+    scene: str
+    """Its name."""
+    rollout: tuple[str, str, int, int]
+    """Method, scene, seed and start."""
+    whole: bool
+    """Whether it was made of all frames of its episode."""
+    visibility: float
+    """Share of the held-out pixels that its frames have seen."""
+    coverage: float
+    """Share of the navigable cells that its frames have observed."""
+    psnr: float
+    """In dB."""
+
+    def share(self, name: str) -> float:
+        """Visibility or coverage."""
+        return self.visibility if name == "visibility" else self.coverage
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A correlation with its name."""
+
+    where: str
+    """Which reconstructions."""
+    found: Correlation | None
+    """None where there are too few."""
+
+
+def points_of(results: Results) -> list[Point]:
+    """All reconstructions of which visibility, coverage and PSNR are known."""
+    curves = {(one.method, *one.key): one.coverage_curve for one in results.rollouts}
+    points = []
+    for one in results.reconstructions:
+        curve = curves.get((one.method, *one.key), ())
+        if one.visibility is None or "psnr" not in one.scores or not 1 <= one.frames <= len(curve):
+            continue
+        rollout = (one.method, *one.key)
+        points.append(
+            Point(one.method, one.key[0], rollout, one.whole, one.visibility, curve[one.frames - 1], one.scores["psnr"])
+        )
+    return points
+
+
+def correlations(points: Sequence[Point], name: str) -> list[Entry]:
+    """Spearman's ρ of visibility or coverage with PSNR: over all, of whole episodes, of first frames, in each scene.
+
+    Args:
+        points: of all reconstructions.
+        name: visibility or coverage.
+    """
+    whole = [point for point in points if point.whole]
+    groups = {"all": list(points), "whole episodes": whole, "first frames": [one for one in points if not one.whole]}
+    scenes = list(dict.fromkeys(point.scene for point in points))
+    for scene in scenes if len(scenes) > 1 else []:
+        groups[f"all in {scene}"] = [point for point in points if point.scene == scene]
+        groups[f"whole episodes in {scene}"] = [point for point in whole if point.scene == scene]
+    return [
+        Entry(
+            where,
+            spearman(
+                [point.share(name) for point in group],
+                [point.psnr for point in group],
+                [point.rollout for point in group],
+            ),
+        )
+        for where, group in groups.items()
+    ]

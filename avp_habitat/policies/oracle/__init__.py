@@ -1,0 +1,1 @@
+"""Planners that know the whole scene: the references `oracle` and `survey`."""

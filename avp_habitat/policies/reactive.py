@@ -1,0 +1,150 @@
+"""The baseline that turns in place, walks on a little and turns again."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.policies.planning import FREE, UNKNOWN, KnownMap, PlanningPolicy, known_map
+from avp_habitat.policies.predicted_views import in_view, make_lens
+from avp_habitat.task.agent_view import AgentView
+from avp_habitat.task.settings import ACTION_NAMES, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT
+
+
+class Memory:
+    """Of one agent within one episode."""
+
+    def __init__(self) -> None:
+        """Remember nothing."""
+        self._stood = np.empty((0, 3))
+        self._misses = np.zeros((0, 0), dtype=np.uint8)
+        self._first = np.zeros(2, dtype=np.int64)
+
+    def update(self, view: AgentView) -> tuple[KnownMap, NDArray[np.uint8]]:
+        """Take in the newest view; call it once per step.
+
+        Returns:
+            The map, and `(rows, columns)` how many views should have observed a cell that is still not observed:
+            something stands there or hides it.
+        """
+        self._stood = np.concatenate([self._stood, view.position[None]])
+        known = known_map(view, self._stood)
+        misses = np.zeros_like(known.state)
+        row, column = np.maximum(self._first - known.first, 0)
+        height, width = self._misses.shape
+        misses[row : row + height, column : column + width] = self._misses
+        if view.steps:
+            missed = _should_see(view, known)
+            misses[tuple(missed.T)] = np.minimum(misses[tuple(missed.T)], 254) + 1
+        self._misses, self._first = misses, known.first
+        return known, misses
+
+
+def _should_see(view: AgentView, known: KnownMap) -> NDArray[np.int64]:
+    """`(k, 2)` cells not observed that the newest view should have shown."""
+    cells = np.argwhere((known.state == FREE) | (known.state == UNKNOWN))
+    row, column = known.at(view.position)
+    lens = make_lens(view.settings, known.cell_m)
+    return cells[in_view(known.state, cells, row, column, view.yaw, view.pitch, lens)]
+
+
+CLEARANCE_M = 1.0
+"""The heuristic walks on while the depth at the image centre is above this (Eq. 23), metres."""
+
+
+class RandomPolicy:
+    """Any of the six actions, with equal odds."""
+
+    def __init__(self, seed: int | None = None) -> None:
+        """Start a random generator of its own."""
+        self._rng = np.random.default_rng(seed)
+
+    @classmethod
+    def for_env(cls, env: Any, seed: int | None = None) -> "RandomPolicy":
+        """The random policy, which asks nothing of the environment."""
+        return cls(seed)
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray[np.int64], Any]:
+        """Actions for `(n, 12)` observations, `(n,)`, or for one `(12,)` observation, `()`; the state is None."""
+        return self._rng.integers(len(ACTION_NAMES), size=np.shape(observation)[:-1]), None
+
+
+class HeuristicPolicy:
+    """Forward while there is room ahead, else left or right with equal odds (Eq. 23); it uses three actions."""
+
+    def __init__(self, centre_depth: Callable[[], NDArray[np.floating]], seed: int | None = None) -> None:
+        """Use a source of depth.
+
+        Args:
+            centre_depth: gives the `(n,)` planar depth in metres in the middle of the newest views; the twelve
+                numbers do not hold it.
+            seed: of the random generator.
+        """
+        self._centre_depth = centre_depth
+        self._rng = np.random.default_rng(seed)
+
+    @classmethod
+    def for_env(cls, env: Any, seed: int | None = None) -> "HeuristicPolicy":
+        """The heuristic for an `AVPEnv` (also a wrapped one) or a vector environment of them."""
+        if hasattr(env, "get_attr"):
+            return cls(lambda: np.array(env.get_attr("centre_depth")), seed)
+        return cls(lambda: np.array([env.get_wrapper_attr("centre_depth")]), seed)
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray[np.int64], Any]:
+        """Actions for `(n, 12)` observations, `(n,)`, or for one `(12,)` observation, `()`; the state is None."""
+        depth = self._centre_depth()
+        turn = np.where(self._rng.random(len(depth)) < 0.5, TURN_LEFT, TURN_RIGHT)
+        action = np.where(depth > CLEARANCE_M, MOVE_FORWARD, turn).astype(np.int64)
+        return action.reshape(np.shape(observation)[:-1]), None
+
+
+WALK_M = 2.0
+"""Length of a walk between two full circles, metres."""
+
+
+class SpinPlanner:
+    """A full circle, then forward by the heuristic's rule for `WALK_M`, and again; it reads no more than a depth."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        """Begin with a full circle."""
+        self._rng = rng
+        self._turns = 0
+        self._walked = 0
+        self._aside: int | None = None
+
+    def act(self, view: AgentView) -> int:
+        """A turn to the left until the circle is full, then forward, or a turn to where there is room."""
+        if self._turns < int(np.ceil(360.0 / view.settings.turn_deg)):
+            self._turns += 1
+            return TURN_LEFT
+        if self._walked and view.collided:
+            return self._begin_circle()
+        if view.centre_depth <= CLEARANCE_M:
+            return self._begin_circle() if self._walked else self._turn_aside(view)
+        if self._walked * view.settings.forward_m >= WALK_M:
+            return self._begin_circle()
+        self._walked += 1
+        return MOVE_FORWARD
+
+    def _begin_circle(self) -> int:
+        self._turns, self._walked, self._aside = 1, 0, None
+        return TURN_LEFT
+
+    def _turn_aside(self, view: AgentView) -> int:
+        """Keep to the side drawn first: turns back and forth would find no room."""
+        if self._aside is None:
+            self._aside = TURN_LEFT if self._rng.random() < 0.5 else TURN_RIGHT
+        return self._aside
+
+
+class SpinPolicy(PlanningPolicy):
+    """`spin`: turn in place, then walk."""
+
+    def make_planner(self, rng: np.random.Generator) -> SpinPlanner:
+        """For one episode."""
+        return SpinPlanner(rng)

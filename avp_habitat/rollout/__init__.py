@@ -1,0 +1,1 @@
+"""The rollout folder: its format, reading, capturing, writing and drawing."""

@@ -1,0 +1,362 @@
+"""Reading a rollout folder, with every fault of it named.
+
+The folder is the contract between the halves of the suite (capturing and reconstructing); `rollout_writer` makes it.
+Nothing is decoded here: pictures are checked by their first and last bytes, so that thousands of frames cost a second.
+"""
+
+import json
+import os
+import reprlib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.errors import RolloutError
+from avp_habitat.poses import Intrinsics, rigidity_fault
+from avp_habitat.rollout.png import GREY_16, RGB_8, check_png_contents, check_png_structure
+
+FORMAT = "avp-rollout"
+FORMAT_VERSION = 1
+POSE_CONVENTION = (
+    "camera_to_world, 4x4, row major, metres; world right-handed with Y up, the floor is the X-Z plane; "
+    "camera axes habitat (= OpenGL): x right, y up, looks along -z"
+)
+HELDOUT = "heldout"
+# A pose that is rigid within this is so within the tolerance of `rigidity_fault`, which decides on all others.
+_CLEARLY_RIGID = 5e-5
+# Of 16 numbers, written with all their digits; a pose file longer than this is none.
+_LONGEST_POSE_BYTES = 4096
+# Beyond any size in pixels or metres.
+_BEYOND_ANY_SIZE = 1e9
+# A rollout.json is nested 3 deep; what walks it recursively can bear this much.
+_DEEPEST = 16
+_NAMED = ("scene", "simulator", "policy")
+_OBJECTS = ("metrics", "versions", "actions")
+
+
+@dataclass(frozen=True)
+class View:
+    """One captured picture with its depth and pose; the files exist and have the right size."""
+
+    image: Path
+    """8-bit RGB PNG."""
+    depth: Path
+    """16-bit PNG, planar depth in millimetres, 0 = none."""
+    camera_to_world: NDArray[np.float64]
+    """`(4, 4)`, habitat axes, metres."""
+
+
+@dataclass(frozen=True)
+class Floor:
+    """The floor seen from above: which cells are navigable, and when each was first observed; the file exists."""
+
+    picture: Path
+    """16-bit grey PNG, rows along +Z, columns along +X: 0 not navigable, 1 never observed, 1 + t first by view t."""
+    cell_m: float
+    """Side of a cell in metres."""
+    origin_m: tuple[float, float]
+    """x and z of the least corner of cell (0, 0), metres."""
+    shape: tuple[int, int]
+    """Rows and columns."""
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """A checked rollout folder."""
+
+    folder: Path
+    """Where it is."""
+    meta: dict[str, Any]
+    """`rollout.json` as read."""
+    intrinsics: Intrinsics
+    """Of all its pictures."""
+    frames: list[View]
+    """The captured frames in the order of the steps."""
+    heldout: list[View]
+    """The held-out views."""
+    floor: Floor | None = None
+    """Its floor cells; None in rollouts that were written before there were any."""
+
+
+def frame_name(index: int) -> str:
+    """The stem of a frame's files."""
+    return f"frame_{index:05d}"
+
+
+def read_rollout(folder: str | Path) -> Rollout:
+    """Read and check a rollout.
+
+    Args:
+        folder: the rollout's folder, or its `rollout.json`.
+
+    Raises:
+        RolloutError: a file is missing, unreadable, of the wrong size, not a rigid transform, leaves the folder, or
+            the format is of another version. The text names the file and says what was expected.
+    """
+    folder = Path(folder)
+    if folder.name == "rollout.json":
+        folder = folder.parent
+    if not folder.is_dir():
+        raise RolloutError(f"{folder}: expected a rollout folder (made by `python -m avp_habitat.collect`), found none")
+    meta = read_meta(folder)
+    intrinsics = _intrinsics(folder / "rollout.json", meta)
+    frames = _read_views(folder, folder, _count(folder, meta, "frames"), intrinsics)
+    heldout = _read_views(folder, folder / HELDOUT, _count(folder, meta, HELDOUT), intrinsics)
+    return Rollout(folder, meta, intrinsics, frames, heldout, _read_floor(folder, meta))
+
+
+def read_meta(folder: Path) -> dict[str, Any]:
+    """`rollout.json` of a folder, everything in it that the suite uses held to its type and range.
+
+    Raises:
+        RolloutError: it is missing, not JSON, not a rollout, of another version, or has an entry of another kind.
+    """
+    path = folder / "rollout.json"
+    meta = read_json(path)
+    if meta.get("format") != FORMAT:
+        raise RolloutError(f"{path}: expected format {FORMAT!r}, found {meta.get('format')!r}")
+    if meta.get("format_version") != FORMAT_VERSION:
+        writer = _of(meta, "versions").get("avp-suite", "of unknown version")
+        raise RolloutError(
+            f"{path}: expected format version {FORMAT_VERSION}, found {meta.get('format_version')!r}, written by "
+            f"avp-suite {writer}; collect it again or read it with that version"
+        )
+    _check_facts(path, meta)
+    _check_origin(path, _of(meta, "scene").get("origin", [0, 0, 0]))
+    _intrinsics(path, meta)
+    for key in ("frames", HELDOUT):
+        _count(folder, meta, key)
+    return meta
+
+
+def name_of(meta: dict[str, Any], key: str) -> str:
+    """The name of a rollout's `scene`, `simulator` or `policy`; empty where there is none."""
+    value = meta.get(key)
+    return value if isinstance(value, str) else _of(meta, key).get("name") or ""
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON file whose top is an object, all of it such that it can be computed with and written again.
+
+    Raises:
+        RolloutError: it is missing, unreadable, not a JSON object, nested without end, or holds a number that is not
+            finite or text that is not Unicode.
+    """
+    _check_inside(path.parent, path)
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise RolloutError(f"{path}: expected this file of the rollout, found none") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise RolloutError(f"{path}: expected JSON, could not read it: {error}") from None
+    if not isinstance(value, dict):
+        raise RolloutError(f"{path}: expected a JSON object, found a {type(value).__name__}")
+    _check_values(path, value, "", 0)
+    return value
+
+
+def _check_values(path: Path, value: Any, name: str, depth: int) -> None:
+    """Python reads NaN, infinity, numbers beyond any float and halves of characters, which nothing else can bear."""
+    if depth > _DEEPEST:
+        raise RolloutError(f"{path}: expected at most {_DEEPEST} levels, {reprlib.repr(name)} is nested deeper")
+    if isinstance(value, str):
+        _check_text(path, value, name)
+    elif isinstance(value, dict):
+        for key, entry in value.items():
+            _check_text(path, key, f"a name in {name or 'the file'}")
+            _check_values(path, entry, f"{name}.{key}".lstrip("."), depth + 1)
+    elif isinstance(value, list):
+        for index, entry in enumerate(value):
+            _check_values(path, entry, f"{name}[{index}]", depth + 1)
+    elif isinstance(value, int | float) and not abs(value) <= sys.float_info.max:
+        raise RolloutError(f"{path}: expected {name} to be a finite number, found {reprlib.repr(value)}")
+
+
+def _check_text(path: Path, text: str, name: str) -> None:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise RolloutError(f"{path}: expected {name} to be Unicode text, found {text[:20]!a}") from None
+
+
+def read_pose(path: Path) -> NDArray[np.float64]:
+    """A `(4, 4)` camera_to_world text file, checked to be rigid.
+
+    Raises:
+        RolloutError: it is missing, not 16 numbers, or not a rigid transform.
+    """
+    return read_poses([str(path)])[0]
+
+
+def read_poses(paths: Sequence[str]) -> NDArray[np.float64]:
+    """`(n, 4, 4)` camera_to_world of text files, checked to be rigid.
+
+    Raises:
+        RolloutError: one is missing, not 16 numbers, or not a rigid transform; the first such file is named.
+    """
+    poses = np.array([_pose_numbers(path) for path in paths]).reshape(-1, 4, 4)
+    for index in np.flatnonzero(~_clearly_rigid(poses)):
+        if fault := rigidity_fault(poses[index]):
+            raise RolloutError(f"{paths[index]}: not a rigid camera_to_world: {fault}")
+    return poses
+
+
+def _pose_numbers(path: str) -> list[float]:
+    try:
+        with open(path, "rb", buffering=0) as file:
+            numbers = [float(word) for word in file.read(_LONGEST_POSE_BYTES).split()]
+    except FileNotFoundError:
+        raise RolloutError(f"{path}: expected this pose file, found none") from None
+    except (OSError, ValueError) as error:
+        raise RolloutError(f"{path}: expected 4 rows of 4 numbers, could not read them: {error}") from None
+    if len(numbers) != 16:
+        raise RolloutError(f"{path}: expected 4 rows of 4 numbers, found {len(numbers)} numbers")
+    if beyond := [number for number in numbers if abs(number) >= _BEYOND_ANY_SIZE]:
+        raise RolloutError(f"{path}: expected metres, found {beyond[0]:g}")
+    return numbers
+
+
+def _clearly_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """`(n,)` whether each of `(n, 4, 4)` is beyond doubt; one call for thousands."""
+    rotations = poses[:, :3, :3]
+    with np.errstate(all="ignore"):
+        skew = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0)
+        last_row = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1, initial=0)
+        turned = np.linalg.det(rotations) > 0
+        finite = np.isfinite(poses).all(axis=(1, 2))
+    return finite & turned & (np.maximum(skew, last_row) < _CLEARLY_RIGID)
+
+
+def _check_facts(path: Path, meta: dict[str, Any]) -> None:
+    """Hold what is shown, logged and computed with to its kind; what is left out is left out."""
+    for key in _NAMED:
+        value = meta.get(key)
+        name = value.get("name") if isinstance(value, dict) else value
+        if not isinstance(name, str | None):
+            raise RolloutError(f"{path}: expected the name of the {key} to be text, found {reprlib.repr(name)}")
+    for key in _OBJECTS:
+        if not isinstance(meta.get(key, {}), dict):
+            raise RolloutError(f"{path}: expected {key} to be an object, found {reprlib.repr(meta[key])}")
+    for key in ("metrics", "actions"):
+        for name, value in meta.get(key, {}).items():
+            if name != "names" and (isinstance(value, bool) or not isinstance(value, int | float)):
+                raise RolloutError(f"{path}: expected {key}.{name} to be a finite number, found {reprlib.repr(value)}")
+
+
+def _check_origin(path: Path, origin: Any) -> None:
+    if not (isinstance(origin, list) and len(origin) == 3 and all(map(_is_finite, origin))):
+        raise RolloutError(f"{path}: expected scene.origin to be three lengths in metres, found {reprlib.repr(origin)}")
+
+
+def _of(meta: dict[str, Any], key: str) -> dict[str, Any]:
+    value = meta.get(key)
+    return value if isinstance(value, dict) else {}
+
+
+def _count(folder: Path, meta: dict[str, Any], key: str) -> int:
+    count = _of(meta, "counts").get(key)
+    if not isinstance(count, int) or isinstance(count, bool) or count < 0:
+        raise RolloutError(
+            f"{folder / 'rollout.json'}: expected counts.{key} to be a whole number, found {reprlib.repr(count)}"
+        )
+    return count
+
+
+def _intrinsics(path: Path, meta: dict[str, Any]) -> Intrinsics:
+    camera = _of(meta, "camera")
+    values: dict[str, Any] = {}
+    for name, kind in (("width", int), ("height", int), ("fx", float), ("fy", float), ("cx", float), ("cy", float)):
+        value = camera.get(name)
+        if not _is_number_of_pixels(value) or (kind is int and value % 1):
+            expected = "a whole number of pixels" if kind is int else "a number of pixels"
+            raise RolloutError(f"{path}: expected camera.{name} to be {expected} above 0, found {reprlib.repr(value)}")
+        values[name] = kind(value)
+    return Intrinsics(**values)
+
+
+def _is_number_of_pixels(value: Any) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < _BEYOND_ANY_SIZE
+
+
+def _read_views(root: Path, base: Path, count: int, intrinsics: Intrinsics) -> list[View]:
+    if not count:
+        return []
+    for kind, suffix in (("images", ".png"), ("depth", ".png"), ("poses", ".txt")):
+        _check_listing(root, base / kind, suffix, count)
+    stems = [frame_name(index) for index in range(count)]
+    poses = read_poses([f"{base}/poses/{stem}.txt" for stem in stems])
+    size = {"width": intrinsics.width, "height": intrinsics.height}
+    for stem in stems:
+        check_png_structure(f"{base}/images/{stem}.png", **size, kind=RGB_8)
+        check_png_structure(f"{base}/depth/{stem}.png", **size, kind=GREY_16)
+    images, depths = base / "images", base / "depth"
+    return [View(images / f"{stem}.png", depths / f"{stem}.png", pose) for stem, pose in zip(stems, poses, strict=True)]
+
+
+def _read_floor(folder: Path, meta: dict[str, Any]) -> Floor | None:
+    if "floor" not in meta:
+        return None
+    entry, about = _of(meta, "floor"), folder / "rollout.json"
+    name, shape, origin, cell = (entry.get(key) for key in ("file", "shape", "origin_m", "cell_m"))
+    if not isinstance(name, str) or not name:
+        raise RolloutError(f"{about}: expected floor.file to be the name of a file, found {name!r}")
+    if not _is_pair(shape) or not all(isinstance(side, int) and _is_number_of_pixels(side) for side in shape):
+        raise RolloutError(f"{about}: expected floor.shape to be rows and columns above 0, found {shape!r}")
+    if not _is_pair(origin) or not all(map(_is_finite, origin)):
+        raise RolloutError(f"{about}: expected floor.origin_m to be x and z in metres, found {origin!r}")
+    if not _is_finite(cell) or cell <= 0:
+        raise RolloutError(f"{about}: expected floor.cell_m to be metres above 0, found {cell!r}")
+    picture = folder / name
+    _check_inside(folder, picture)
+    check_png_structure(str(picture), width=shape[1], height=shape[0], kind=GREY_16)
+    check_png_contents(picture)
+    return Floor(picture, float(cell), (float(origin[0]), float(origin[1])), (shape[0], shape[1]))
+
+
+def _is_pair(value: Any) -> TypeGuard[list[Any]]:
+    return isinstance(value, list) and len(value) == 2
+
+
+def _is_finite(value: Any) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(abs(value) < _BEYOND_ANY_SIZE)
+
+
+def _check_listing(root: Path, folder: Path, suffix: str, count: int) -> None:
+    """Hold a folder to exactly the files of `count` frames; links may lead anywhere, as into a store of DVC."""
+    _check_inside(root, folder)
+    try:
+        with os.scandir(folder) as entries:
+            plain = {
+                entry.name: entry.is_file(follow_symlinks=False) for entry in entries if entry.name.endswith(suffix)
+            }
+    except OSError as error:
+        raise RolloutError(f"{folder}: expected {count} files, could not list it: {error.strerror}") from None
+    # The count may be anything: the search ends at the first name that is not there.
+    expected: set[str] = set()
+    for index in range(count):
+        if (name := frame_name(index) + suffix) not in plain:
+            raise RolloutError(f"{folder / name}: expected this file ({count} frames by rollout.json), found none")
+        expected.add(name)
+    if extra := sorted(plain.keys() - expected):
+        raise RolloutError(f"{folder / extra[0]}: a frame that rollout.json does not count ({count} frames)")
+    for name in sorted(name for name, file in plain.items() if not file):
+        _check_inside(root, folder / name)
+        if not (folder / name).is_file():
+            raise RolloutError(f"{folder / name}: expected a file, found something else (a folder, a broken link, …)")
+
+
+def _check_inside(root: Path, path: Path) -> None:
+    """Refuse a path that leaves the rollout as it is written, and a link that leads to itself."""
+    if not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(root)):
+        raise RolloutError(f"{path}: expected a path inside {root}")
+    try:
+        path.resolve(strict=path.is_symlink())
+    except FileNotFoundError:
+        raise RolloutError(f"{path}: expected a file, found a link to {os.readlink(path)}, which is missing") from None
+    except (OSError, RuntimeError):
+        raise RolloutError(f"{path}: expected a file, found a link that leads to itself") from None

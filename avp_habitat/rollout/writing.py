@@ -1,0 +1,182 @@
+"""Writing a rollout folder so that it exists only when it is whole."""
+
+import csv
+import json
+from collections import deque
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.errors import RolloutError
+from avp_habitat.files import NewFolder
+from avp_habitat.poses import Intrinsics
+from avp_habitat.rollout import images
+from avp_habitat.rollout.format import FORMAT, FORMAT_VERSION, HELDOUT, POSE_CONVENTION, View, frame_name
+
+_THREADS = 4
+_AHEAD = 8
+"""At most so many pictures wait to be encoded and written, which bounds the memory."""
+
+
+class RolloutWriter:
+    """A context in which frames are written to a temporary folder, renamed to its final name by `publish`.
+
+    Views are encoded in threads while the next are rendered: their arrays must not change once they were added, and a
+    disk that fails is reported by one of the next calls, by `publish` at the latest.
+    Leaving the context without `publish` (an error, Ctrl-C) removes the temporary folder.
+    """
+
+    def __init__(self, folder: str | Path, intrinsics: Intrinsics) -> None:
+        """Reserve a folder.
+
+        Args:
+            folder: the final name; must not exist.
+            intrinsics: of every picture.
+
+        Raises:
+            UsageError: the folder exists.
+            RolloutError: its parent cannot be written.
+        """
+        self.intrinsics = intrinsics
+        self._new = NewFolder(folder, failure=RolloutError)
+        self.folder = self._new.folder
+        self._poses: dict[str, list[NDArray[np.float64]]] = {"": [], HELDOUT: []}
+        self._steps: list[dict[str, Any]] = []
+        self._threads = ThreadPoolExecutor(_THREADS)
+        self._pending: deque[Future[None]] = deque()
+
+    def __enter__(self) -> "RolloutWriter":
+        """Make the temporary folder."""
+        self._new.__enter__()
+        try:
+            for base in ("", HELDOUT):
+                for kind in ("images", "depth", "poses"):
+                    (self.path(base) / kind).mkdir(parents=True)
+        except OSError as error:
+            self._new.__exit__(type(error), error, None)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Remove what was not published; report a full or failing disk as such."""
+        self._threads.shutdown(cancel_futures=True)
+        self._new.__exit__(kind, error, trace)
+
+    def add_frame(self, rgb: NDArray[np.uint8], depth: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
+        """Write the next captured frame: `(h, w, 3)` uint8, `(h, w)` metres, `(4, 4)` habitat camera_to_world."""
+        self._add("", rgb, depth, pose)
+
+    def add_heldout(self, rgb: NDArray[np.uint8], depth: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
+        """Write the next held-out view: `(h, w, 3)` uint8, `(h, w)` metres, `(4, 4)` habitat camera_to_world."""
+        self._add(HELDOUT, rgb, depth, pose)
+
+    def add_step(self, row: Mapping[str, Any]) -> None:
+        """Remember the next row of `steps.csv`; a key that only some rows have is 0 in the others."""
+        self._steps.append(dict(row))
+
+    def views(self, *, heldout: bool) -> list[View]:
+        """The captured frames, or the held-out views, so far; all of them are written."""
+        self._finish(waiting=0)
+        base = HELDOUT if heldout else ""
+        images, depths = self.path(base) / "images", self.path(base) / "depth"
+        names = [f"{frame_name(index)}.png" for index in range(len(self._poses[base]))]
+        return [View(images / n, depths / n, pose) for n, pose in zip(names, self._poses[base], strict=True)]
+
+    def path(self, name: str) -> Path:
+        """Where to write a further file of the folder."""
+        return self._new.path(name)
+
+    def publish(self, meta: Mapping[str, Any]) -> Path:
+        """Write the tables, then give the folder its final name.
+
+        Args:
+            meta: the keys of `rollout.json` beyond format, counts, camera size and pose convention.
+
+        Raises:
+            UsageError: a folder of that name has appeared meanwhile.
+        """
+        self._finish(waiting=0)
+        self._write_steps()
+        self._write_json("transforms.json", self._transforms())
+        self._write_json("rollout.json", self._rollout(meta))
+        return self._new.publish()
+
+    def _add(self, base: str, rgb: NDArray[np.uint8], depth: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
+        folder, stem = self.path(base), frame_name(len(self._poses[base]))
+        rows = "\n".join(" ".join(f"{value:.9f}" for value in row) for row in pose)
+        (folder / "poses" / f"{stem}.txt").write_text(rows + "\n", encoding="ascii")
+        self._poses[base].append(np.asarray(pose, dtype=np.float64))
+        self._pending.append(self._threads.submit(images.write_rgb, folder / "images" / f"{stem}.png", rgb))
+        self._pending.append(self._threads.submit(images.write_depth, folder / "depth" / f"{stem}.png", depth))
+        self._finish(waiting=_AHEAD)
+
+    def _finish(self, *, waiting: int) -> None:
+        """Wait until at most so many pictures are still to be written; raises what went wrong with the others."""
+        while len(self._pending) > waiting:
+            self._pending.popleft().result()
+
+    def _rollout(self, meta: Mapping[str, Any]) -> dict[str, Any]:
+        camera = {
+            "width": self.intrinsics.width,
+            "height": self.intrinsics.height,
+            "fx": self.intrinsics.fx,
+            "fy": self.intrinsics.fy,
+            "cx": self.intrinsics.cx,
+            "cy": self.intrinsics.cy,
+        }
+        return {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "pose_convention": POSE_CONVENTION,
+            "counts": {"frames": len(self._poses[""]), HELDOUT: len(self._poses[HELDOUT])},
+            "depth": {"unit": "millimetre", "kind": "planar z-depth", "none": 0},
+            **meta,
+            "camera": camera | dict(meta.get("camera", {})),
+        }
+
+    def _transforms(self) -> dict[str, Any]:
+        names = {
+            base: [f"{base}/images/{frame_name(i)}.png".lstrip("/") for i in range(len(poses))]
+            for base, poses in self._poses.items()
+        }
+        frames = [
+            {
+                "file_path": name,
+                "depth_file_path": name.replace("images/", "depth/"),
+                "transform_matrix": pose.tolist(),
+            }
+            for base, poses in self._poses.items()
+            for name, pose in zip(names[base], poses, strict=True)
+        ]
+        camera = self.intrinsics
+        return {
+            "camera_model": "OPENCV",
+            "w": camera.width,
+            "h": camera.height,
+            "fl_x": camera.fx,
+            "fl_y": camera.fy,
+            "cx": camera.cx,
+            "cy": camera.cy,
+            "depth_unit_scale_factor": images.DEPTH_UNIT_M,
+            "train_filenames": names[""],
+            "val_filenames": names[HELDOUT],
+            "test_filenames": names[HELDOUT],
+            "frames": frames,
+        }
+
+    def _write_steps(self) -> None:
+        with self.path("steps.csv").open("w", newline="", encoding="utf-8") as file:
+            names = dict.fromkeys(name for row in self._steps for name in row)
+            writer = csv.DictWriter(file, fieldnames=list(names), restval=0)
+            writer.writeheader()
+            writer.writerows(self._steps)
+
+    def _write_json(self, name: str, value: Mapping[str, Any]) -> None:
+        text = json.dumps(value, indent=2, allow_nan=False)
+        self.path(name).write_text(text + "\n", encoding="utf-8")

@@ -1,0 +1,234 @@
+"""Furnished rooms that are made up from a number: `builtin:SEED`."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from avp_habitat.errors import UsageError
+from avp_habitat.scenes.builtin import decor, groups, seating, storage
+from avp_habitat.scenes.builtin.floorplan import Floor, Placed, places, stand_at
+from avp_habitat.scenes.builtin.groups import Arrange, Member
+from avp_habitat.scenes.builtin.kit import Kit, Lamp, Piece, shifted
+from avp_habitat.scenes.builtin.lighting import bake
+from avp_habitat.scenes.builtin.random import Dice
+from avp_habitat.scenes.builtin.shapes import Surface, joined
+from avp_habitat.scenes.builtin.shell import Shell, Wall, build_shell, plan_shell
+from avp_habitat.scenes.mesh import TexturedMesh, merge
+
+PICTURES = ((0.9, 0.65), (0.5, 0.7), (0.6, 0.85), (0.7, 0.5), (1.2, 0.8))
+"""Widths and heights of frames in metres."""
+MIDDLE_M = 1.6
+"""Height at which the middle of a picture hangs."""
+
+
+def _hang_one(floor: Floor, dice: Dice, kit: Kit, wall: Wall, right: float, *, clock: bool) -> bool:
+    """Hang a picture or clock at a place on a wall if nothing is in its way."""
+    width, height = (0.34, 0.34) if clock else dice.pick(PICTURES)
+    low, high = MIDDLE_M - height / 2, MIDDLE_M + height / 2
+    stand = stand_at(Member(Piece("", [], width, 0.06, high), 0.0, 0.03), wall, right, 0.0)
+    if not floor.is_free(stand, low, high, 0.1):
+        return False
+    surfaces = decor.clock(kit) if clock else decor.picture(kit, dice, width, height)
+    piece = Piece("clock" if clock else "picture", shifted(surfaces, 0.0, MIDDLE_M, -0.03), width, 0.06, high)
+    floor.hang(Placed(piece, stand.axes, stand.position, stand.footprint), low, high)
+    return True
+
+
+def hang_pictures(floor: Floor, dice: Dice, kit: Kit) -> None:
+    """Pictures on every wall that has room for them, one clock in some rooms."""
+    clock = dice.chance(0.6)
+    for wall in dice.shuffled(floor.shell.walls):
+        wanted = 3 if wall.length > 3 else 1
+        for right in dice.shuffled(places(0.5, wall.length - 0.4, 0.2)):
+            if wanted and _hang_one(floor, dice, kit, wall, right, clock=clock):
+                wanted, clock = wanted - 1, False
+
+
+def hang_lamp(floor: Floor, dice: Dice, kit: Kit) -> None:
+    """A pendant above the dining table, or where the room is open."""
+    shell = floor.shell
+    tables = [stand.position for stand in floor.placed if stand.piece.kind == "dining table"]
+    x0, z0, x1, z1 = shell.bounds
+    bottom = min(2.1, round(shell.ceiling - 0.62, 2))
+    piece = decor.pendant(kit, dice, shell.ceiling, bottom)
+    half = piece.width / 2
+    for x, z in tables or [((x0 + x1) / 2 + 0.1, (z0 + z1) / 2), (x0 + 1.2, z0 + 1.2), (x1 - 1.2, z1 - 1.2)]:
+        stand = Placed(piece, np.eye(3), (x, z), (x - half, z - half, x + half, z + half))
+        if floor.is_free(stand, bottom - 0.05, shell.ceiling, 0.03):
+            floor.hang(stand, bottom - 0.05, shell.ceiling)
+            return
+
+
+Spot = tuple[Wall, float, float]
+"""A wall, metres along it and metres in front of it."""
+
+MAIN, EXTRA, SMALL = 0.45, 0.42, 0.41
+"""Share of the floor that stays walkable after placing main groups, storage, and what fills corners."""
+
+
+def _put(floor: Floor, arrange: Arrange, spots: Iterable[Spot], least_share: float) -> bool:
+    """Place a group at the first spot where it fits and leaves enough of the floor walkable."""
+    for wall, right, inwards in spots:
+        group = arrange(floor.shell.depth_at(wall, right) - inwards)
+        if group is not None and floor.try_group(group, wall, right, inwards, least_share=least_share):
+            return True
+    return False
+
+
+def _at_walls(floor: Floor, dice: Dice) -> Iterator[Spot]:
+    """Places along all walls in random order."""
+    for wall in dice.shuffled(floor.shell.walls):
+        for right in dice.shuffled(places(0.3, wall.length - 0.3, 0.2)):
+            yield wall, right, 0.0
+
+
+def _in_corners(floor: Floor, dice: Dice, distance: float) -> Iterator[Spot]:
+    """Places at walls, a distance in metres from their ends, in random order."""
+    for wall in dice.shuffled(floor.shell.walls):
+        for right in dice.shuffled([distance, wall.length - distance]):
+            yield wall, right, 0.0
+
+
+def _anywhere(floor: Floor, dice: Dice) -> Iterator[Spot]:
+    """Places in the open floor in random order."""
+    for wall in dice.shuffled(floor.shell.walls):
+        spots = [(r, i) for r in places(0.6, wall.length - 0.5, 0.3) for i in places(0.1, 4.0, 0.3)]
+        for right, inwards in dice.shuffled(spots)[:120]:
+            yield wall, right, inwards
+
+
+def _across(floor: Floor, dice: Dice) -> Iterator[Spot]:
+    """Places at long walls, away from their ends, in random order."""
+    for wall in dice.shuffled([wall for wall in floor.shell.walls if wall.length >= 3.0]):
+        for share in dice.shuffled([0.3, 0.36, 0.43, 0.5, 0.57, 0.64, 0.7]):
+            yield wall, round(wall.length * share, 2), 0.0
+
+
+def _storage(kit: Kit, dice: Dice) -> list[Arrange]:
+    """Tall and low furniture for walls, the second shelf and chest last."""
+    first = [
+        groups.against_wall(storage.bookshelf(kit, dice), 0.55),
+        groups.against_wall(storage.wardrobe(kit, dice), 0.6),
+        groups.against_wall(storage.drawers(kit, dice), 0.5),
+    ]
+    second = [
+        groups.against_wall(storage.bookshelf(kit, dice), 0.55),
+        groups.against_wall(storage.drawers(kit, dice), 0.5),
+    ]
+    return dice.shuffled(first) + second
+
+
+def _put_living(floor: Floor, dice: Dice, kit: Kit) -> bool:
+    """Sofa, television and what belongs to them, as much as fits."""
+    return any(_put(floor, arrange, _at_walls(floor, dice), MAIN) for arrange in groups.living(kit, dice))
+
+
+def _put_main_groups(floor: Floor, dice: Dice, kit: Kit) -> None:
+    """What the room is for, by its size, and what parts it."""
+    area = floor.shell.floor_area
+    sleeps = dice.chance(0.6 if area > 22 else 0.4)
+    sits = area > 20 or not sleeps
+    sits = sits and _put_living(floor, dice, kit)
+    sleeps = (sleeps or not sits) and _put(floor, groups.sleeping(kit, dice), _at_walls(floor, dice), MAIN)
+    if not sits and not sleeps:
+        sits = _put_living(floor, dice, kit)
+    if not (sits and sleeps) or area > 30:
+        _put(floor, groups.dining(kit, dice), _anywhere(floor, dice), MAIN)
+    any(_put(floor, arrange, _across(floor, dice), MAIN) for arrange in groups.divider(kit, dice, floor.shell.ceiling))
+
+
+def _put_the_rest(floor: Floor, dice: Dice, kit: Kit) -> None:
+    """Desk, storage, a place to read, and what fills corners, as long as the floor stays walkable."""
+    first, *rest = _storage(kit, dice)
+    for arrange in (groups.working(kit, dice), first):
+        _put(floor, arrange, _at_walls(floor, dice), EXTRA)
+    any(_put(floor, arrange, _at_walls(floor, dice), EXTRA) for arrange in groups.reading(kit, dice))
+    for arrange in rest:
+        _put(floor, arrange, _at_walls(floor, dice), EXTRA)
+    for _ in range(2):
+        _put(floor, groups.against_wall(decor.plant(kit, dice), 0.0), _in_corners(floor, dice, 0.42), SMALL)
+    if sum(stand.piece.kind == "side table" for stand in floor.placed) < 2:
+        _put(floor, groups.against_wall(seating.side_table(kit, dice), 0.3), _at_walls(floor, dice), SMALL)
+
+
+def furnish(shell: Shell, dice: Dice, kit: Kit) -> list[Placed]:
+    """Furniture of a room, none of it in another's place, the door free, the floor walkable and in one part."""
+    floor = Floor(shell)
+    _put_main_groups(floor, dice, kit)
+    _put_the_rest(floor, dice, kit)
+    hang_lamp(floor, dice, kit)
+    hang_pictures(floor, dice, kit)
+    return floor.placed
+
+
+GENERATOR_VERSION = 1
+"""Rises whenever a seed's room changes, so that results name the room that they were measured in."""
+
+
+def _checked(seed: int) -> int:
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise UsageError(f"builtin:{seed}: expected a whole number of 0 or greater as the room's seed, got {seed!r}")
+    return int(seed)
+
+
+def plan_room(seed: int) -> tuple[Shell, list[Placed]]:
+    """The empty room and its furniture, before light is baked.
+
+    Args:
+        seed: 0 or greater.
+
+    Raises:
+        UsageError: the seed is not a whole number of 0 or greater.
+    """
+    seed = _checked(seed)
+    shell = plan_shell(Dice(seed, 1))
+    return shell, furnish(shell, Dice(seed, 2), Kit(seed))
+
+
+def _snapped(values: np.ndarray) -> np.ndarray:
+    """Rounded to whole 2^-13 (0.12 mm), so that the last bits of a platform's sine do not matter.
+
+    A power of two, because sums of decimal lengths then never lie half-way between two steps.
+    """
+    return np.rint(values * 8192) / 8192
+
+
+def _mesh(surface: Surface, colours: np.ndarray) -> TexturedMesh:
+    """A surface as the renderers take it."""
+    return TexturedMesh(
+        surface.vertices.astype(np.float32),
+        surface.triangles.astype(np.int32),
+        surface.uv.astype(np.float32),
+        (np.rint(colours * 255) / 255).astype(np.float32),
+        np.zeros(len(surface.triangles), np.int32),
+        [surface.material.picture],
+    )
+
+
+def _in_world(stand: Placed, lamp: Lamp) -> Lamp:
+    x, y, z = stand.axes @ np.asarray(lamp.position) + [stand.position[0], 0.0, stand.position[1]]
+    return Lamp((float(x), float(y), float(z)), lamp.strength)
+
+
+def generate_room(seed: int) -> TexturedMesh:
+    """A furnished room: metres, Y up, floor at y = 0, closed on all sides, the same for the same seed.
+
+    Args:
+        seed: 0 or greater; decides outline, height, colours, furniture and textures.
+
+    Raises:
+        UsageError: the seed is not a whole number of 0 or greater.
+    """
+    seed = _checked(seed)
+    kit = Kit(seed)
+    shell = plan_shell(Dice(seed, 1))
+    placed = furnish(shell, Dice(seed, 2), kit)
+    surfaces = build_shell(kit, Dice(seed, 3), shell)
+    lamps = []
+    for stand in placed:
+        surfaces += stand.surfaces()
+        lamps += [_in_world(stand, lamp) for lamp in stand.piece.lamps]
+    surfaces = [replace(s, vertices=_snapped(s.vertices), uv=_snapped(s.uv)) for s in joined(surfaces)]
+    colours = bake(shell, surfaces, lamps)
+    return merge([_mesh(surface, colour) for surface, colour in zip(surfaces, colours, strict=True)])

@@ -1,0 +1,155 @@
+"""The surface of a scene as points with normals, and how well a view from somewhere shows them."""
+
+import weakref
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.errors import UsageError
+from avp_habitat.poses import Intrinsics, unproject
+from avp_habitat.simulators.base import Simulator
+from avp_habitat.task.motion import sensor_poses
+from avp_habitat.task.settings import TaskSettings
+
+Float = NDArray[np.floating]
+
+EDGE_M = 0.25
+"""One point for each cube of this edge and each of six directions that surface in it faces, metres."""
+FULL_DISTANCE_M = 2.0
+"""d₀: a surface seen straight on from this near, or nearer, is seen with quality 1, metres."""
+
+_PLACES = 60
+_YAWS_DEG = (0.0, 90.0, 180.0, 270.0)
+_PITCHES_DEG = (-45.0, 0.0, 45.0)
+_CAMERA = Intrinsics.from_hfov(96, 72, hfov_deg=100.0)
+_FLAT_SHARE = 0.002
+"""A pixel has a normal where its four neighbours lie this close to its plane, as a share of its distance: the rounded
+normals of edges and corners would else count as surfaces that face a direction of their own."""
+
+_BEFORE_M = 0.01
+
+
+@dataclass(frozen=True)
+class View:
+    """A depth image that looks from some place in some direction."""
+
+    place: NDArray[np.float64]
+    """`(3,)` metres, on the floor below the camera."""
+    camera_to_world: NDArray[np.float64]
+    """`(4, 4)` habitat axes."""
+    points: NDArray[np.float64]
+    """`(height, width, 3)` what the pixels show, metres, world frame."""
+    hit: NDArray[np.bool_]
+    """`(height, width)` whether a pixel shows a surface within range."""
+
+
+@dataclass(frozen=True)
+class SceneSurface:
+    """m points all over what can be seen in a scene: walls, furniture, ceiling and floor."""
+
+    points: NDArray[np.float64]
+    """`(m, 3)` metres, world frame."""
+    normals: NDArray[np.float64]
+    """`(m, 3)` unit vectors out of the surface, to the side from which it was seen."""
+
+
+def views_all_over(simulator: Simulator, settings: TaskSettings) -> Iterator[View]:
+    """What is seen all around from places all over the floor, the same ones every time.
+
+    Args:
+        simulator: of the scene.
+        settings: of the task: sensor height and range.
+    """
+    centres = simulator.area.centres
+    places = centres[np.unique(np.linspace(0, len(centres) - 1, min(len(centres), _PLACES)).astype(int))]
+    yaw, pitch = (np.radians(grid.ravel()) for grid in np.meshgrid(_YAWS_DEG, _PITCHES_DEG))
+    for place in places:
+        pose = sensor_poses(settings, np.repeat(place[None], len(yaw), axis=0), yaw, pitch)
+        depth = simulator.render(pose, _CAMERA, rgb=False).depth
+        for each, image in zip(pose, depth, strict=True):
+            hit = (image > 0) & (image <= settings.max_range_m)
+            yield View(place, each, np.asarray(unproject(image, each, _CAMERA), dtype=np.float64), hit)
+
+
+def view_quality(eye: Float, points: Float, normals: Float) -> NDArray[np.float64]:
+    """How well surface points are seen from a place: cos(ray, normal) · min(1, d₀ / distance), 0 from behind.
+
+    Args:
+        eye: `(..., 3)` metres.
+        points: `(..., 3)` metres.
+        normals: `(..., 3)` unit vectors.
+
+    Returns:
+        `(...)` within [0, 1], wherever the point lies in the image and whatever lies between.
+    """
+    offset = eye - points
+    distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-9)
+    cosine = (offset * normals).sum(axis=-1) / distance
+    quality = np.clip(cosine, 0.0, 1.0) * np.minimum(1.0, FULL_DISTANCE_M / distance)
+    return np.asarray(quality, dtype=np.float64)
+
+
+_known: weakref.WeakKeyDictionary[Simulator, dict[tuple[float, float], SceneSurface]] = weakref.WeakKeyDictionary()
+
+
+def scene_surface(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
+    """The surface of a scene; found once for an open simulator.
+
+    Of the pixels that show the same cube, facing alike, the one that is seen best gives point and normal.
+
+    Raises:
+        UsageError: the scene shows no surface at all.
+    """
+    known = _known.setdefault(simulator, {})
+    key = (settings.sensor_height_m, settings.max_range_m)
+    if key not in known:
+        known[key] = _find(simulator, settings)
+    return known[key]
+
+
+def _find(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
+    found: list[NDArray[np.float64]] = [np.zeros((0, 7))]
+    for view in views_all_over(simulator, settings):
+        eye = view.camera_to_world[:3, 3]
+        normals, flat = _normals(view, eye)
+        points, normals = view.points[flat], normals[flat]
+        found.append(_best(np.column_stack([points, normals, view_quality(eye, points, normals)])))
+    rows = _best(np.concatenate(found))
+    if not len(rows):
+        raise UsageError(
+            f"reward or observation of surfaces: {simulator.scene} shows none; expected walls or furniture"
+        )
+    return SceneSurface(np.ascontiguousarray(rows[:, :3]), np.ascontiguousarray(rows[:, 3:6]))
+
+
+def _normals(view: View, eye: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """`(height, width, 3)` unit normals towards the camera, and where the surface is flat enough to have one."""
+    points, middle = view.points, view.points[1:-1, 1:-1]
+    neighbours = (points[1:-1, 2:], points[1:-1, :-2], points[2:, 1:-1], points[:-2, 1:-1])
+    cross = np.cross(neighbours[0] - neighbours[1], neighbours[2] - neighbours[3])
+    normal = cross / np.maximum(np.linalg.norm(cross, axis=-1, keepdims=True), 1e-12)
+    towards = eye - middle
+    normal *= np.where((normal * towards).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    off = np.max([np.abs((normal * (other - middle)).sum(axis=-1)) for other in neighbours], axis=0)
+    depth = np.linalg.norm(towards, axis=-1)
+    hit = view.hit
+    inside = hit[1:-1, 1:-1] & hit[1:-1, 2:] & hit[1:-1, :-2] & hit[2:, 1:-1] & hit[:-2, 1:-1]
+    normals, flat = np.zeros_like(points), np.zeros(hit.shape, dtype=np.bool_)
+    normals[1:-1, 1:-1] = normal
+    flat[1:-1, 1:-1] = inside & (off <= _FLAT_SHARE * depth)
+    return normals, flat
+
+
+def _best(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of `(n, 7)` points, normals and qualities the best one of each cube and direction, ordered by these."""
+    # Just before the surface: a wall that lies in the border of two layers of cubes would else be in both.
+    cube = np.floor((rows[:, :3] + _BEFORE_M * rows[:, 3:6]) / EDGE_M).astype(np.int64)
+    axis = np.abs(rows[:, 3:6]).argmax(axis=1)
+    side = np.take_along_axis(rows[:, 3:6], axis[:, None], axis=1)[:, 0] > 0
+    order = np.lexsort([-rows[:, 6], side, axis, *cube.T])
+    keys = np.column_stack([cube, axis, side])[order]
+    first = np.ones(len(rows), dtype=np.bool_)
+    first[1:] = (keys[1:] != keys[:-1]).any(axis=1)
+    return rows[order[first]]

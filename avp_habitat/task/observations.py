@@ -1,0 +1,250 @@
+"""The spaces of `AVP-v0` as gymnasium describes them."""
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.compiled import njit
+from avp_habitat.navigation.area import NavigableArea
+from avp_habitat.surface.map import SIZE as SURFACE_SIZE
+from avp_habitat.task.settings import ACTION_NAMES
+
+Float = NDArray[np.floating]
+
+NAMES = (
+    "t / T",
+    "dx / r",
+    "dz / r",
+    "sin yaw",
+    "cos yaw",
+    "sin pitch",
+    "cos pitch",
+    "min depth",
+    "mean depth",
+    "coverage",
+    "collided",
+    "distance to mean / r",
+)
+"""What each number is; r is the diameter of the navigable area."""
+LOW = np.array([0, -1, -1, -1, -1, -1, -1, 0, 0, 0, 0, 0], dtype=np.float32)
+HIGH = np.ones(12, dtype=np.float32)
+
+
+def depth_statistics(depth: Float, max_range_m: float) -> tuple[Float, Float]:
+    """Least and mean depth as shares of the range, `(n,)` each, clipped to [0, 1].
+
+    Args:
+        depth: `(n, h, w)` planar depth in metres, 0 where nothing was hit, which counts as the whole range.
+        max_range_m: what the value 1 stands for.
+    """
+    shares = np.where(depth > 0, np.minimum(depth / max_range_m, 1.0), 1.0).reshape(len(depth), -1)
+    return shares.min(axis=1), shares.mean(axis=1)
+
+
+def observation(
+    *,
+    progress: Float,
+    offset: Float,
+    yaw: Float,
+    pitch: Float,
+    min_depth: Float,
+    mean_depth: Float,
+    coverage: Float,
+    collided: NDArray[np.bool_],
+    spread: Float,
+) -> NDArray[np.float32]:
+    """Observations of n agents in the order of `NAMES`.
+
+    Args:
+        progress: `(n,)` t / T.
+        offset: `(n, 2)` x and z from the start, in units of r.
+        yaw: `(n,)` radians, left positive.
+        pitch: `(n,)` radians, up positive.
+        min_depth: `(n,)` share of 10 m.
+        mean_depth: `(n,)` share of 10 m.
+        coverage: `(n,)` within [0, 1].
+        collided: `(n,)` whether the last step did.
+        spread: `(n,)` ‖p − p̄‖ in units of r.
+
+    Returns:
+        `(n, 12)` float32 within [`LOW`, `HIGH`].
+    """
+    columns = [
+        progress,
+        offset[:, 0],
+        offset[:, 1],
+        np.sin(yaw),
+        np.cos(yaw),
+        np.sin(pitch),
+        np.cos(pitch),
+        min_depth,
+        mean_depth,
+        coverage,
+        collided,
+        spread,
+    ]
+    return np.clip(np.stack(columns, axis=1).astype(np.float32), LOW, HIGH)
+
+
+OBSERVED, FRONTIER, RIM = range(3)
+
+
+@njit(cache=True)
+def draw(index, first_seen, rows, place, yaw, scale, maps):
+    """Count floor cells by channel and map cell.
+
+    Args:
+        index: `(rows + 2, columns + 2)` number of each navigable cell, -1 elsewhere, with a border of -1.
+        first_seen: `(n, >= m)` 0 for cells not observed.
+        rows: `(k,)` the agents' rows of it.
+        place: `(k, 2)` x and z of the agents in floor cells from the grid's corner.
+        yaw: `(k,)` radians.
+        scale: floor cells along a map cell's side.
+        maps: `(k, 3, side, side)` output, zeros before.
+    """
+    for k in range(len(rows)):
+        seen = first_seen[rows[k]]
+        ahead_x, ahead_z = -np.sin(yaw[k]) / scale, -np.cos(yaw[k]) / scale
+        for i in range(1, index.shape[0] - 1):
+            for j in range(1, index.shape[1] - 1):
+                if index[i, j] >= 0 and seen[index[i, j]] != 0:
+                    x, z = j - 0.5 - place[k, 0], i - 0.5 - place[k, 1]
+                    ahead, right = x * ahead_x + z * ahead_z, z * ahead_x - x * ahead_z
+                    _enter(maps[k], ahead, right, *_edges(index, seen, i, j))
+
+
+@njit(cache=True)
+def _edges(index, seen, i, j):
+    """Whether an observed cell lies beside floor not yet observed, and beside what is not navigable."""
+    frontier, rim = False, False
+    for di, dj in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+        other = index[i + di, j + dj]
+        if other < 0:
+            rim = True
+        elif seen[other] == 0:
+            frontier = True
+    return frontier, rim
+
+
+@njit(cache=True)
+def _enter(channels, ahead, right, frontier, rim):
+    """Count an observed cell at a place in map cells from the agent; frontiers beyond the map on its border."""
+    side = channels.shape[1]
+    row, column = int(np.floor(side / 2 - ahead)), int(np.floor(side / 2 + right))
+    if 0 <= row < side and 0 <= column < side:
+        channels[OBSERVED, row, column] += 1
+        channels[RIM, row, column] += rim
+    if frontier:
+        channels[FRONTIER, min(max(row, 0), side - 1), min(max(column, 0), side - 1)] += 1
+
+
+@njit(cache=True)
+def draw_surface(points, facing, quality, rows, eye, yaw, cell_m, maps):
+    """Count the surface points seen, and sum their qualities, by group and map cell.
+
+    Args:
+        points: `(m, 3)` metres.
+        facing: `(m,)` 1 up, 0 sideways, -1 down.
+        quality: `(n, m)` how well each was seen, 0 for never.
+        rows: `(k,)` the agents' rows of it.
+        eye: `(k, 3)` the agents' cameras, metres.
+        yaw: `(k,)` radians.
+        cell_m: side of a map cell, metres.
+        maps: `(k, 4, 2, side, side)` output, zeros before.
+    """
+    side = maps.shape[3]
+    for k in range(len(rows)):
+        seen = quality[rows[k]]
+        ahead_x, ahead_z = -np.sin(yaw[k]) / cell_m, -np.cos(yaw[k]) / cell_m
+        for j in range(len(points)):
+            if seen[j] > 0:
+                x, z = points[j, 0] - eye[k, 0], points[j, 2] - eye[k, 2]
+                ahead, right = x * ahead_x + z * ahead_z, z * ahead_x - x * ahead_z
+                row, column = int(np.floor(side / 2 - ahead)), int(np.floor(side / 2 + right))
+                if 0 <= row < side and 0 <= column < side:
+                    group = _group(facing[j], points[j, 1] - eye[k, 1])
+                    maps[k, group, 0, row, column] += 1
+                    maps[k, group, 1, row, column] += seen[j]
+
+
+@njit(cache=True)
+def _group(facing, height):
+    """Number of `surface_map.GROUPS` for a point at a height from the camera."""
+    if facing > 0:
+        return 0
+    if facing < 0:
+        return 3
+    return 1 if height < 0 else 2
+
+
+SIDE = 20
+"""Map cells along a side; the agent stands in the middle, its heading points to row 0."""
+CELL_M = 0.4
+"""Side of a map cell in metres."""
+CHANNELS = ("observed", "frontier", "rim")
+"""observed: share of the map cell's ground that is observed floor. frontier: observed floor beside floor that is not
+yet observed. rim: observed floor beside what is not navigable. The last two are lengths in sides of a map cell, up to
+1."""
+SIZE = len(CHANNELS) * SIDE * SIDE
+
+
+class MapObserver:
+    """Draws the maps of agents in one scene."""
+
+    def __init__(self, area: NavigableArea) -> None:
+        """Number the scene's cells."""
+        self._origin = area.origin
+        self._cell_m = area.cell_m
+        # A border of cells outside, so that every cell has four neighbours.
+        self._index = np.full((area.mask.shape[0] + 2, area.mask.shape[1] + 2), -1, dtype=np.int32)
+        self._index[1:-1, 1:-1][area.mask] = np.arange(np.count_nonzero(area.mask))
+
+    def observe(
+        self,
+        first_seen: NDArray[np.int16],
+        rows: NDArray[np.integer],
+        position: NDArray[np.floating],
+        yaw: NDArray[np.floating],
+    ) -> NDArray[np.float32]:
+        """The maps of k agents.
+
+        Args:
+            first_seen: `(n, >= m)` 0 for cells not observed.
+            rows: `(k,)` the agents' rows of it.
+            position: `(k, 3)` their feet, metres.
+            yaw: `(k,)` radians.
+
+        Returns:
+            `(k, SIZE)` within [0, 1], channel after channel, row after row from ahead to behind, left to right. What
+            lies beyond the map is drawn on its border, frontiers only.
+        """
+        pass
+
+        maps = np.zeros((len(rows), len(CHANNELS), SIDE, SIDE), dtype=np.float32)
+        place = (np.asarray(position)[:, [0, 2]] - self._origin) / self._cell_m
+        per_side = CELL_M / self._cell_m
+        draw(self._index, first_seen, rows, place, np.asarray(yaw), per_side, maps)
+        maps[:, 0] /= per_side**2
+        maps[:, 1:] /= per_side
+        return np.minimum(maps, 1.0).reshape(len(rows), SIZE)
+
+
+def observation_space(kind: str) -> gymnasium.Space[NDArray[np.float32]]:
+    """Observations of a kind.
+
+    Args:
+        kind: one of `settings.OBSERVATION_NAMES`.
+
+    Returns:
+        float32; `(12,)` for `numbers`, `(13 + map_observation.SIZE,)` (the numbers, whether C ≥ τ, the map) for `map`,
+        and `surface_map.SIZE` more for `surface_map`.
+    """
+    further = {"map": 1 + SIZE, "surface_map": 1 + SIZE + SURFACE_SIZE}.get(kind, 0)
+    low = np.concatenate([LOW, np.zeros(further, np.float32)])
+    high = np.concatenate([HIGH, np.ones(further, np.float32)])
+    return gymnasium.spaces.Box(low, high, dtype=np.float32)  # type: ignore[return-value]
+
+
+def action_space() -> gymnasium.spaces.Discrete:
+    """The six actions, numbered as in `settings.ACTION_NAMES`."""
+    return gymnasium.spaces.Discrete(len(ACTION_NAMES))

@@ -1,0 +1,75 @@
+"""The settings of the task, with the design's defaults."""
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from avp_habitat.errors import UsageError
+from avp_habitat.poses import Intrinsics
+from avp_habitat.ranges import Range, hold_ranges
+from avp_habitat.task.rewards import RewardConstants, check_reward
+
+ACTION_NAMES = ("move_forward", "turn_left", "turn_right", "look_up", "look_down", "stop")
+MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, LOOK_UP, LOOK_DOWN, STOP = range(len(ACTION_NAMES))
+COVERAGE_MODES = ("visible", "over")
+OBSERVATION_NAMES = ("numbers", "map", "surface_map")
+
+
+@dataclass(frozen=True)
+class TaskSettings:
+    """Everything about the task but the scene."""
+
+    reward: str = "proposed"
+    """Name of the reward: coverage, coverage_redundancy, proposed or surface."""
+    constants: RewardConstants = field(default_factory=RewardConstants)
+    """The rewards' constants."""
+    budget: Annotated[int, Range(1, 32767)] = 80
+    """T: steps, which are views, per episode."""
+    forward_m: Annotated[float, Range(0.01, 10)] = 0.25
+    """Length of a forward move in metres."""
+    turn_deg: Annotated[float, Range(0.1, 180)] = 10.0
+    """Yaw of one turn in degrees."""
+    tilt_deg: Annotated[float, Range(0.1, 90)] = 10.0
+    """Pitch of one look up or down in degrees."""
+    pitch_limit_deg: Annotated[float, Range(0, 89)] = 60.0
+    """Greatest pitch, up and down, in degrees."""
+    collision_m: Annotated[float, Range(0, 10)] = 0.05
+    """A forward move shorter than this, in metres, is a collision."""
+    sensor_height_m: Annotated[float, Range(0.01, 10)] = 1.5
+    """Height of the camera above the floor under the agent, metres."""
+    hfov_deg: Annotated[float, Range(1, 175)] = 90.0
+    """Horizontal field of view in degrees."""
+    width: Annotated[int, Range(1, 4096)] = 160
+    """Width of the policy's depth image in pixels."""
+    height: Annotated[int, Range(1, 4096)] = 120
+    """Height of the policy's depth image in pixels."""
+    max_range_m: Annotated[float, Range(0.1, 1000)] = 10.0
+    """Cells farther than this from the camera are not observed; also the unit of the depth observations, metres."""
+    tolerance_m: Annotated[float, Range(0, 1)] = 0.1
+    """A hit this close before a floor point still observes it, metres along the ray."""
+    coverage_mode: Literal["visible", "over"] = "visible"
+    """visible: a cell's floor point is seen. over: a camera ray passes over the cell."""
+    observation: Literal["numbers", "map", "surface_map"] = "numbers"
+    """numbers: the twelve of the design. map: these, whether C ≥ τ, and a map of what was seen of the floor around the
+    agent. surface_map: these, and maps of what was seen of walls, furniture and ceiling."""
+    lookup: bool = False
+    """Whether views are looked up in tables of the scene instead of casting all their rays: faster, for training."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot work, by the option's name."""
+        check_reward(self.reward)
+        hold_ranges(self)
+        if self.collision_m >= self.forward_m:
+            raise UsageError(
+                f"collision_m: expected less than forward_m ({self.forward_m:g}), or every move is a collision, got "
+                f"{self.collision_m:g}"
+            )
+
+    @property
+    def with_surface(self) -> bool:
+        """Whether what was seen of the scene's surface is computed: the reward or the observation needs it."""
+        return self.reward == "surface" or self.observation == "surface_map"
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Of the policy's depth image."""
+        return Intrinsics.from_hfov(self.width, self.height, hfov_deg=self.hfov_deg)

@@ -1,0 +1,355 @@
+"""The task for n agents at a time: actions, views, coverage, rewards and the ends of episodes, over arrays.
+
+`AVPEnv` is n = 1, the batched vector environment is n > 1; this is the only place where the task's maths is put
+together. Every step of an agent captures one view, also a step that does not move it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat import poses
+from avp_habitat.simulators.base import Simulator
+from avp_habitat.surface.map import SIZE as SURFACE_MAP_SIZE
+from avp_habitat.surface.memory import RoomSurface, room_surfaces
+from avp_habitat.task import motion
+from avp_habitat.task.agent_view import AgentView
+from avp_habitat.task.observations import SIZE as MAP_SIZE
+from avp_habitat.task.observations import MapObserver, observation
+from avp_habitat.task.perception import Perception, Senses, Views, make_senses
+from avp_habitat.task.rewards import StepFacts, has_stop, reward_parts, stops_episode
+from avp_habitat.task.settings import MOVE_FORWARD, STOP, TaskSettings
+from avp_habitat.task.trajectory import Trajectory
+
+Float = NDArray[np.floating]
+Rows = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class StepOutcome:
+    """What one step of n agents gave; every array's first axis is n."""
+
+    observation: NDArray[np.float32]
+    """`(n, 12)`, or longer with a map."""
+    reward: NDArray[np.float64]
+    """`(n,)` sum of the parts."""
+    parts: dict[str, NDArray[np.float64]]
+    """`(n,)` each named part of the reward."""
+    terminated: NDArray[np.bool_]
+    """`(n,)` stop was chosen with enough coverage."""
+    truncated: NDArray[np.bool_]
+    """`(n,)` the budget ran out without such a stop."""
+    facts: StepFacts
+    """What the reward was computed from."""
+
+
+@dataclass(frozen=True)
+class _Room:
+    """One scene and the agents in it."""
+
+    simulator: Simulator
+    senses: Senses
+    maps: MapObserver
+    cells: int
+    rows: Rows
+    surface: RoomSurface | None
+
+
+class ViewpointTask:
+    """The state of n agents, each in its scene."""
+
+    def __init__(self, simulators: Simulator | Sequence[Simulator], settings: TaskSettings, agents: int) -> None:
+        """Make room for n agents; `reset` places them.
+
+        Args:
+            simulators: one for each scene, never named further; agent i is in scene i modulo their number.
+            settings: of the task.
+            agents: n, at least 1.
+
+        Raises:
+            UsageError: the settings ask for what a simulator cannot do.
+        """
+        scenes = list(simulators) if isinstance(simulators, Sequence) else [simulators]
+        self.settings = settings
+        self.agents = agents
+        self._everyone = np.arange(agents)
+        self._room_of = self._everyone % len(scenes)
+        scenes = scenes[:agents]
+        surfaces = room_surfaces(scenes, settings, self._room_of)
+        self._rooms = [
+            _Room(
+                scene,
+                make_senses(scene, settings),
+                MapObserver(scene.area),
+                len(scene.area.centres),
+                np.flatnonzero(self._room_of == index),
+                surface,
+            )
+            for index, (scene, surface) in enumerate(zip(scenes, surfaces, strict=True))
+        ]
+        self._cells = np.array([self._rooms[index].cells for index in self._room_of])
+        self._diameter = np.array([self._rooms[index].simulator.area.diameter_m for index in self._room_of])
+        budget = settings.budget
+        self.steps = np.zeros(agents, dtype=np.int64)
+        self.position = np.zeros((agents, 3))
+        self.yaw = np.zeros(agents)
+        self.pitch = np.zeros(agents)
+        self._first_seen = np.zeros((agents, self._cells.max()), dtype=np.int16)
+        self._observed = np.zeros(agents, dtype=np.int64)
+        self._collided = np.zeros(agents, dtype=np.bool_)
+        # Row 0 is the start, row t the state after step t.
+        self._path = np.zeros((agents, budget + 1, 3))
+        self._angles = np.zeros((agents, budget + 1, 2))
+        self._cell = np.zeros((agents, budget + 1, 2), dtype=np.int64)
+        self._log = {
+            name: np.zeros((agents, budget)) for name in ("action", "reward", "coverage", "collided", "redundant")
+        }
+        # By the names that the reward gives them, from the first step that has them; zero in all others.
+        self._parts: dict[str, NDArray[np.float64]] = {}
+
+    def simulator(self, row: int) -> Simulator:
+        """The simulator of one agent's scene."""
+        return self._rooms[self._room_of[row]].simulator
+
+    def first_seen(self, row: int) -> NDArray[np.int16]:
+        """`(m,)` for each cell of one agent's scene, the step whose view first observed it; 0 for never."""
+        return self._first_seen[row, : self._cells[row]]
+
+    def surface_share(self, row: int) -> float | None:
+        """Σ Q / m of one agent's episode: how well it has seen the scene's surface, within [0, 1].
+
+        None where it is not computed: neither the reward nor the observation needs it.
+        """
+        surface = self._rooms[self._room_of[row]].surface
+        return None if surface is None else float(surface.quality(row).mean())
+
+    def centre_depth(self, row: int) -> float:
+        """Planar depth in metres in the middle of an agent's newest view, the whole range where nothing is hit."""
+        rows = np.array([row])
+        return float(self._rooms[self._room_of[row]].senses.centre_depth(self._views(rows))[0])
+
+    @property
+    def coverage(self) -> NDArray[np.float64]:
+        """`(n,)` C of the running episodes (Eq. 17)."""
+        return self._observed / self._cells
+
+    @property
+    def camera_to_world(self) -> NDArray[np.float64]:
+        """`(n, 4, 4)` the sensors' poses now, habitat axes."""
+        return motion.sensor_poses(self.settings, self.position, self.yaw, self.pitch)
+
+    def reset(self, rows: Sequence[int] | NDArray[np.integer], position: Float, yaw: Float) -> NDArray[np.float32]:
+        """Start new episodes of some agents, looking straight ahead.
+
+        Args:
+            rows: which agents.
+            position: `(len(rows), 3)` their feet, metres.
+            yaw: `(len(rows),)` radians.
+
+        Returns:
+            `(len(rows), 12)` first observations, longer with a map; their views are not captured and observe nothing.
+        """
+        rows = np.asarray(rows, dtype=np.int64)
+        self.position[rows], self.yaw[rows], self.pitch[rows] = position, poses.wrap_angle(yaw), 0.0
+        self.steps[rows], self._first_seen[rows], self._collided[rows], self._observed[rows] = 0, 0, False, 0
+        self._remember(rows)
+        least, mean = np.empty((2, len(rows)))
+        for room, chosen in self._by_room(rows):
+            seen = room.senses.look(self._views(rows[chosen]))
+            least[chosen], mean[chosen] = seen.least, seen.mean
+            if room.surface is not None:
+                room.surface.reset(rows[chosen])
+        return self._observe(rows, Perception(least, mean, np.zeros(len(rows), dtype=np.int64)), np.zeros(len(rows)))
+
+    def step(self, actions: NDArray[np.integer]) -> StepOutcome:
+        """Advance every agent by one action and one captured view.
+
+        Args:
+            actions: `(n,)` numbers of `settings.ACTION_NAMES`.
+        """
+        actions = np.asarray(actions)
+        self._collided = self._move(actions)
+        self.steps += 1
+        self._remember(self._everyone)
+        seen = self._capture()
+        self._observed += seen.new_cells
+        facts = self._facts(actions, seen.new_cells, self._capture_surface())
+        parts = reward_parts(self.settings.reward, facts, self.settings.constants)
+        reward = np.sum(list(parts.values()), axis=0) + np.zeros(self.agents)
+        terminated = stops_episode(facts, self.settings.constants)
+        self._record(actions, reward, parts, facts)
+        return StepOutcome(
+            observation=self._observe(self._everyone, seen, facts.spread_m),
+            reward=reward,
+            parts=parts,
+            terminated=terminated,
+            truncated=(self.steps >= self.settings.budget) & ~terminated,
+            facts=facts,
+        )
+
+    def trajectory(self, row: int) -> Trajectory:
+        """Copies of what one agent did so far in its episode."""
+        steps = int(self.steps[row])
+        log, parts = (
+            {name: values[row, :steps].copy() for name, values in columns.items()}
+            for columns in (self._log, self._parts)
+        )
+        position = self._path[row, 1 : steps + 1].copy()
+        yaw, pitch = self._angles[row, 1 : steps + 1].T.copy()
+        return Trajectory(
+            start=self._path[row, 0].copy(),
+            position=position,
+            yaw=yaw,
+            pitch=pitch,
+            camera_to_world=motion.sensor_poses(self.settings, position, yaw, pitch),
+            action=log["action"].astype(np.int64),
+            reward=log["reward"],
+            reward_parts=parts,
+            coverage=log["coverage"],
+            collided=log["collided"].astype(np.bool_),
+            redundant=log["redundant"].astype(np.bool_),
+            first_seen=self.first_seen(row).copy(),
+            surface=self.surface_share(row),
+        )
+
+    def agent_view(self, row: int) -> AgentView:
+        """What planners may know about one agent."""
+        return AgentView(
+            settings=self.settings,
+            simulator=self.simulator(row),
+            position=self.position[row].copy(),
+            yaw=float(self.yaw[row]),
+            pitch=float(self.pitch[row]),
+            steps=int(self.steps[row]),
+            observed=self.first_seen(row) > 0,
+            centre_depth=self.centre_depth(row),
+            collided=bool(self._collided[row]),
+        )
+
+    def _by_room(self, rows: Rows) -> list[tuple[_Room, NDArray[np.integer]]]:
+        """The rooms of some agents, and which of those agents are in each."""
+        if len(self._rooms) == 1:
+            return [(self._rooms[0], np.arange(len(rows)))]
+        rooms = self._room_of[rows]
+        return [(self._rooms[index], np.flatnonzero(rooms == index)) for index in np.unique(rooms)]
+
+    def _views(self, rows: Rows) -> Views:
+        position, yaw, pitch = self.position[rows], self.yaw[rows], self.pitch[rows]
+        return Views(position, yaw, pitch, motion.sensor_poses(self.settings, position, yaw, pitch))
+
+    def _remember(self, rows: Rows) -> None:
+        """Enter where some agents are now into their paths."""
+        steps = self.steps[rows]
+        self._path[rows, steps] = self.position[rows]
+        self._angles[rows, steps, 0], self._angles[rows, steps, 1] = self.yaw[rows], self.pitch[rows]
+        for room, chosen in self._by_room(rows):
+            self._cell[rows[chosen], steps[chosen]] = room.simulator.area.cell_of(self.position[rows[chosen]])
+
+    def _move(self, actions: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """Apply the actions; `(n,)` whether a forward move was blocked."""
+        self.yaw, self.pitch = motion.turn(self.settings, actions, self.yaw, self.pitch)
+        collided = np.zeros(self.agents, dtype=np.bool_)
+        walking = np.flatnonzero(actions == MOVE_FORWARD)
+        for room, chosen in self._by_room(walking):
+            rows = walking[chosen]
+            before = self.position[rows]
+            after = motion.walk(room.simulator.area, self.settings, actions[rows], before, self.yaw[rows])
+            collided[rows] = np.linalg.norm((after - before)[:, [0, 2]], axis=1) < self.settings.collision_m
+            self.position[rows] = after
+        return collided
+
+    def _capture(self) -> Perception:
+        """What the newest views of all agents show; their new cells are marked."""
+        if len(self._rooms) == 1:
+            room = self._rooms[0]
+            return room.senses.capture(self._views(room.rows), self._first_seen, room.rows, self.steps)
+        whole = Perception(np.empty(self.agents), np.empty(self.agents), np.empty(self.agents, dtype=np.int64))
+        for room in self._rooms:
+            part = room.senses.capture(self._views(room.rows), self._first_seen, room.rows, self.steps[room.rows])
+            for column in fields(Perception):
+                getattr(whole, column.name)[room.rows] = getattr(part, column.name)
+        return whole
+
+    def _capture_surface(self) -> NDArray[np.float64]:
+        """`(n,)` ΔS of the newest views; zeros where nothing needs it."""
+        gain = np.zeros(self.agents)
+        for room in self._rooms:
+            if room.surface is not None:
+                gain[room.rows] = room.surface.capture(self._views(room.rows), room.rows)
+        return gain
+
+    def _facts(self, actions: NDArray[np.integer], new_cells: NDArray[np.integer], new_surface: Float) -> StepFacts:
+        from avp_habitat.task.motion import history
+
+        constants = self.settings.constants
+        past = history(
+            self._path,
+            self._angles,
+            self._cell,
+            self.steps,
+            distance_m=constants.redundancy_distance_m,
+            angle_rad=float(np.radians(constants.redundancy_angle_deg)),
+        )
+        return StepFacts(
+            new_cells=new_cells,
+            new_surface=new_surface,
+            earlier_visits=past.earlier_visits,
+            spread_m=past.spread_m,
+            collided=self._collided,
+            redundant=past.redundant,
+            stop_chosen=(actions == STOP) & has_stop(self.settings.reward),
+            coverage=self.coverage,
+            steps_left=self.settings.budget - self.steps,
+        )
+
+    def _observe(self, rows: Rows, seen: Perception, spread_m: NDArray[np.number]) -> NDArray[np.float32]:
+        radius = self._diameter[rows]
+        numbers = observation(
+            progress=self.steps[rows] / self.settings.budget,
+            offset=(self.position[rows] - self._path[rows, 0])[:, [0, 2]] / radius[:, None],
+            yaw=self.yaw[rows],
+            pitch=self.pitch[rows],
+            min_depth=seen.least,
+            mean_depth=seen.mean,
+            coverage=self.coverage[rows],
+            collided=self._collided[rows],
+            spread=np.asarray(spread_m, dtype=np.float64) / radius,
+        )
+        if self.settings.observation == "numbers":
+            return numbers
+        return np.concatenate([numbers, self._maps(rows)], axis=1)
+
+    def _maps(self, rows: Rows) -> NDArray[np.float32]:
+        """`(len(rows), 1 + …)` whether C ≥ τ, the map of the floor, and those of the surface when asked for."""
+        with_surface = self.settings.observation == "surface_map"
+        floor = 1 + MAP_SIZE
+        maps = np.empty((len(rows), floor + with_surface * SURFACE_MAP_SIZE), dtype=np.float32)
+        maps[:, 0] = self.coverage[rows] >= self.settings.constants.stop_coverage
+        for room, chosen in self._by_room(rows):
+            at = rows[chosen]
+            maps[chosen, 1:floor] = room.maps.observe(self._first_seen, at, self.position[at], self.yaw[at])
+            if with_surface:
+                assert room.surface is not None
+                maps[chosen, floor:] = room.surface.observe(at, self.position[at], self.yaw[at])
+        return maps
+
+    def _record(
+        self, actions: NDArray[np.integer], reward: Float, parts: dict[str, NDArray[np.float64]], facts: StepFacts
+    ) -> None:
+        now = (self._everyone, self.steps - 1)
+        columns = {
+            "action": actions,
+            "reward": reward,
+            "coverage": facts.coverage,
+            "collided": facts.collided,
+            "redundant": facts.redundant,
+        }
+        for name, values in columns.items():
+            self._log[name][now] = values
+        for name in parts:
+            if name not in self._parts:
+                self._parts[name] = np.zeros((self.agents, self.settings.budget))
+        for name, column in self._parts.items():
+            column[now] = parts.get(name, 0.0)

@@ -1,0 +1,1 @@
+"""The method `avp-nerfacto`: configuration, model, training and scores."""

@@ -1,0 +1,1 @@
+"""Trainings of nerfstudio as MLflow runs and Rerun recordings."""

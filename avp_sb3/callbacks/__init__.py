@@ -1,0 +1,1 @@
+"""Callbacks for Stable-Baselines3: metrics, MLflow, Rerun and evaluation."""

@@ -1,0 +1,161 @@
+"""The best model of a training so far, kept in one file that nothing half-written ever replaces."""
+
+import json
+import os
+import uuid
+import warnings
+import zipfile
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from avp_habitat.errors import AVPError, UsageError
+from avp_habitat.policies.saved_model import statistics_names
+
+WHEN = "DATE-TIME"
+"""In a file's name: replaced by when the training started."""
+LESS_IS_BETTER = frozenset({"views", "path_length_m", "collisions", "redundant_share"})
+"""Scores of which the smallest is the best."""
+_TRAINING, _BEST = "avp_training_id", "avp_best"
+
+
+class BestModelError(AVPError):
+    """A best model that cannot be kept where it was asked for."""
+
+
+class BestModel:
+    """Compares scores, and keeps the model with the best one.
+
+    A model carries an identity of its training in `avp_training_id`, and the score in `avp_best`; both are in its
+    `.zip`, so that a resumed training goes on with its own file and never touches another's. The statistics of a
+    training with `VecNormalize` lie beside it as `NAME_vecnormalize.pkl`.
+    """
+
+    def __init__(self, path: str | Path | None, score: str) -> None:
+        """Describe what is kept.
+
+        Args:
+            path: of the file; `DATE-TIME` in it is replaced by when the training started; None to compare only.
+            score: what is compared.
+        """
+        self.path: Path | None = None
+        self.value: float | None = None
+        self._wanted = None if path is None else Path(path)
+        self._score = score
+
+    def start(self, model: BaseAlgorithm) -> None:
+        """Find the file's name, and go on from the file that is there when it is this training's own.
+
+        Raises:
+            UsageError: the file is another training's, or this one's best by another score.
+            BestModelError: the folder cannot be written.
+        """
+        if not hasattr(model, _TRAINING):
+            # From the system: the training's own random numbers stay as they are.
+            setattr(model, _TRAINING, uuid.uuid4().hex)
+        self.value = None
+        if self._wanted is None:
+            return
+        self.path = path = self._path()
+        files = [path] if model.get_vec_normalize_env() is None else [path, statistics_of(path)]
+        if found := [file for file in files if file.is_symlink() or file.exists()]:
+            self.value = self._own_value(path, found[0], getattr(model, _TRAINING))
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with _part(path).open("ab"):
+                pass
+            _part(path).unlink()
+        except OSError as error:
+            raise BestModelError(f"best_model {path}: cannot be written there: {error.strerror or error}") from None
+
+    def offer(self, model: BaseAlgorithm, value: float) -> bool:
+        """Keep the model if its score is better than all before; whether it was kept.
+
+        A score of nan is never better. A file that cannot be written is a warning; the training goes on.
+        """
+        if not self._is_better(value):
+            return False
+        if self.path is not None:
+            setattr(model, _BEST, {"score": self._score, "value": value, "step": model.num_timesteps})
+            try:
+                save_model(model, self.path)
+            except OSError as error:
+                warnings.warn(f"best_model {self.path}: not written: {error}", stacklevel=2)
+                return False
+        self.value = value
+        return True
+
+    def _is_better(self, value: float) -> bool:
+        sign = -1 if self._score in LESS_IS_BETTER else 1
+        return value == value and (self.value is None or sign * value > sign * self.value)
+
+    def _path(self) -> Path:
+        assert self._wanted is not None
+        wanted = self._wanted if self._wanted.suffix == ".zip" else self._wanted.with_name(f"{self._wanted.name}.zip")
+        if WHEN not in wanted.name:
+            return wanted
+        path = wanted.with_name(wanted.name.replace(WHEN, f"{datetime.now():%Y%m%d-%H%M%S}"))
+        stem, number = path.stem, 1
+        while path.exists() or path.is_symlink():
+            number += 1
+            path = path.with_stem(f"{stem}-{number}")
+        return path
+
+    def _own_value(self, path: Path, found: Path, training: str) -> float:
+        held = _held(path)
+        if held.get(_TRAINING) != training:
+            raise UsageError(
+                f"best_model {found}: exists already and is not of this training; choose another name, remove it, or "
+                "resume the training that made it"
+            )
+        best = held.get(_BEST) or {}
+        if best.get("score") != self._score:
+            raise UsageError(
+                f"best_model {path}: holds this training's best by {best.get('score')!r}, asked for is "
+                f"{self._score!r}; choose another name"
+            )
+        return float(best["value"])
+
+
+def statistics_of(path: Path) -> Path:
+    """Beside a model that trains with `VecNormalize`: the statistics without which it is worth nothing."""
+    return statistics_names(path)[0]
+
+
+def save_model(model: BaseAlgorithm, path: Path) -> None:
+    """Write a model, and beside it the statistics of a training with `VecNormalize`; each file is whole or not there.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    normalised = model.get_vec_normalize_env()
+    if normalised is not None:
+        _replace(statistics_of(path), normalised.save)
+    _replace(path, model.save)
+
+
+def _replace(path: Path, save: Callable[[str], None]) -> None:
+    part = _part(path)
+    try:
+        save(os.fspath(part))
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _part(path: Path) -> Path:
+    # Stable-Baselines3 leaves a name alone only when it has a suffix.
+    return path.with_name(f"{path.name}.{os.getpid()}.part")
+
+
+def _held(path: Path) -> dict[str, Any]:
+    """What a model's file says in plain JSON, without unpickling anything; empty for another kind of file."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            held = json.loads(archive.read("data"))
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile):
+        return {}
+    return held if isinstance(held, dict) else {}

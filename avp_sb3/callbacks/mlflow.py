@@ -1,0 +1,328 @@
+"""A training of Stable-Baselines3 as an MLflow run."""
+
+import atexit
+import json
+import logging
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from io import BytesIO
+from numbers import Real
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import mlflow
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Figure, Image, KVWriter
+
+from avp_habitat.errors import UsageError
+from avp_habitat.provenance import flat
+from avp_habitat.tracking.journal import spool_folder
+from avp_habitat.tracking.opening import NewRun, continue_run, join_run, may_continue, recover_in_background, start_run
+from avp_habitat.tracking.run import Status, TrackedRun
+from avp_habitat.tracking.stores import DEFAULT_ADDRESS, about_run, shown
+from avp_sb3.callbacks.base import LoggedFile, finished_episodes, is_learning
+from avp_sb3.callbacks.run_facts import hyperparameters, run_name, scene_tags, task_settings
+
+if TYPE_CHECKING:
+    from avp_habitat.task.trajectory import Trajectory
+
+
+FORMAT = "mlflow"
+"""The name by which `logger.record(..., exclude="mlflow")` keeps a value away from MLflow."""
+_log = logging.getLogger(__name__)
+
+
+class MLflowWriter(KVWriter):
+    """Hands what the logger dumps to a run: numbers, texts (as tags), pictures (by step) and files."""
+
+    def __init__(self, run: TrackedRun) -> None:
+        """Write to a run, which stays open."""
+        self._run = run
+        self._told: set[str] = set()
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """Take one dump at `step` (environment steps); values of other kinds are named once."""
+        numbers, texts = {}, {}
+        for key, value in key_values.items():
+            if FORMAT in (key_excluded.get(key) or ()):
+                continue
+            if isinstance(value, str):
+                texts[key] = value
+            elif (number := _number(value)) is not None:
+                numbers[key] = number
+            else:
+                self._keep(key, value, step)
+        self._run.metrics(numbers, step)
+        self._run.tags(texts)
+
+    def close(self) -> None:
+        """Nothing: the run is closed by whoever opened it."""
+
+    def _keep(self, key: str, value: Any, step: int) -> None:
+        if isinstance(value, LoggedFile):
+            self._run.file(value.path, value.name)
+        elif isinstance(value, (Image, Figure)) and (rgb := _pixels(value)) is not None:
+            self._run.image(key, rgb, step)
+        elif key not in self._told:
+            self._told.add(key)
+            _log.warning("%s: MLflow takes numbers, texts, pictures and files here, not %s", key, type(value).__name__)
+
+
+def _number(value: Any) -> float | None:
+    """A Python, numpy or one-element tensor number as float; None for anything else."""
+    if isinstance(value, Real):
+        return float(value)
+    if getattr(value, "shape", None) == () and hasattr(value, "item"):
+        return float(value.item())
+    return None
+
+
+def _pixels(value: Image | Figure) -> NDArray[np.uint8] | None:
+    """A picture as `(h, w, 3)` bytes; None for an arrangement of axes other than HWC, CHW and HW."""
+    if isinstance(value, Figure):
+        from PIL import Image as Files
+
+        buffer = BytesIO()
+        value.figure.savefig(buffer, format="png")
+        return np.asarray(Files.open(buffer).convert("RGB"))
+    pixels = np.asarray(value.image)
+    order = {"HWC": (0, 1, 2), "CHW": (1, 2, 0), "HW": (0, 1)}.get(value.dataformats.upper())
+    if order is None or pixels.ndim != len(order):
+        return None
+    pixels = pixels.transpose(order)
+    # As TensorBoard reads them: floats within [0, 1], whole numbers within [0, 255].
+    if np.issubdtype(pixels.dtype, np.floating):
+        pixels = np.clip(255 * pixels, 0, 255).round()
+    pixels = pixels.astype(np.uint8).reshape(*pixels.shape[:2], -1)[..., :3]
+    return np.repeat(pixels, 3, axis=-1) if pixels.shape[-1] == 1 else pixels
+
+
+MODEL_FILE, STATISTICS_FILE = "model.zip", "model_vecnormalize.pkl"
+PARAMS_FILE = "params.json"
+TRAJECTORY_FILE = "trajectory.png"
+
+
+class MLflowCallback(BaseCallback):
+    """Makes each `learn()` one MLflow run: parameters, everything SB3 logs by environment step, model, last trajectory.
+
+    One line is enough:
+
+        model.learn(300_000, callback=[MetricsCallback(), MLflowCallback()])
+
+    and in rl_zoo3's hyper-parameters `callback: avp_sb3.MLflowCallback`. Nothing waits for MLflow: what is logged is on
+    disk at once (`runs/mlflow-spool`) and with MLflow some seconds later. When the server is gone it is kept, and sent
+    when the server is back or by `python -m avp_habitat.tracking.deliver`.
+
+    `learn(reset_num_timesteps=False)` with a model whose run was interrupted goes on in the same run. The run of a
+    training that was killed is closed as KILLED at the next start.
+
+    SB3 tells its callbacks nothing when `learn()` is left by an exception or Ctrl-C. To have the run closed at that
+    moment and with the right status (FAILED, or KILLED for an interruption), make it a context:
+
+        with MLflowCallback() as mlflow_callback:
+            model.learn(300_000, callback=mlflow_callback)
+
+    Without it an unfinished run is closed when the host cleans up (rl_zoo3), at the next `learn()` with this callback,
+    by `close()`, or else when Python exits: FAILED if an exception ended the program, KILLED otherwise.
+    """
+
+    def __init__(
+        self,
+        experiment: str | None = None,
+        run_name: str | None = None,
+        tracking_uri: str | None = None,
+        *,
+        run_id: str | None = None,
+        log_model: bool = True,
+        checkpoint_s: float = 30.0,
+        offline: bool | None = None,
+        params: Mapping[str, Any] | None = None,
+        tags: Mapping[str, str] | None = None,
+        verbose: int = 1,
+    ) -> None:
+        """Describe the run; nothing is contacted before the training starts.
+
+        Args:
+            experiment: MLflow experiment, made when it does not exist; when omitted, what `mlflow.set_experiment`,
+                `MLFLOW_EXPERIMENT_ID` or `MLFLOW_EXPERIMENT_NAME` say, else `avp`. Not used within an active run.
+            run_name: name of the run; when omitted, algorithm, reward, scene and seed.
+            tracking_uri: where runs are kept; when omitted, what `mlflow.set_tracking_uri` or `MLFLOW_TRACKING_URI`
+                say, else `sqlite:///mlflow.db` in the current folder.
+            run_id: go on with this run; when omitted, with the model's own if it was interrupted.
+            log_model: keep the model as artifact `model.zip`, at the end unless the training failed, and on the way;
+                with `model_vecnormalize.pkl` where it trains under `VecNormalize`.
+            checkpoint_s: seconds between two models that are kept on the way, each in place of the one before.
+            offline: True goes on when the server does not answer at the start, and sends everything later; when
+                omitted, as the variable `AVP_MLFLOW_OFFLINE` says.
+            params: further parameters; nested mappings become dotted names.
+            tags: further tags.
+            verbose: 1 prints at the end which run it was and how to look at it, 2 also at the start; 0 prints nothing.
+
+        Raises:
+            UsageError: a number that cannot be right.
+        """
+        super().__init__(verbose)
+        if not checkpoint_s > 0:
+            raise UsageError(f"MLflowCallback checkpoint_s: expected seconds above 0, got {checkpoint_s}")
+        self.run_id: str | None = None
+        self._new = NewRun(experiment=experiment, name=run_name)
+        self._tracking_uri = tracking_uri
+        self._wanted_run = run_id
+        self._log_model = log_model
+        self._checkpoint_s = checkpoint_s
+        self._offline = offline
+        self._params = dict(params or {})
+        self._tags = dict(tags or {})
+        self._run: TrackedRun | None = None
+        self._writer: MLflowWriter | None = None
+        self._saved_at = 0.0
+        self._last_episode: tuple[int, Trajectory] | None = None
+
+    def __enter__(self) -> "MLflowCallback":
+        """Promise that the run is closed when the block is left."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close a run that is still open with the status that the exception deserves."""
+        self.close("KILLED" if kind is None else _status_of(error))
+
+    def close(self, status: Status = "KILLED") -> None:
+        """Send what is left and close the run with this status, if it is still open."""
+        if self._run is None:
+            return
+        run, self._run = self._run, None
+        atexit.unregister(self._close_at_exit)
+        try:
+            self._write_pending_values()
+            if status != "FAILED":
+                self._save_model(run)
+                self._save_trajectory(run)
+        except Exception as error:
+            status = "FAILED"
+            _log.warning("MLflow run %s: closing it went wrong: %r", run.run_id, error)
+        finally:
+            if self._writer in self.logger.output_formats:
+                self.logger.output_formats.remove(self._writer)
+            delivered = run.close(status)
+            self._remember(run)
+            if self.verbose:
+                print(about_run(run.run_id, run.address, delivered=delivered), flush=True)
+
+    def _on_training_start(self) -> None:
+        self.close("KILLED")
+        self._last_episode = None
+        earlier = self._models_run()
+        self._run = run = self._open_run()
+        self._remember(run)
+        atexit.register(self._close_at_exit)
+        try:
+            self._log_facts(run, earlier)
+        except BaseException as error:
+            self.close(_status_of(error))
+            raise
+        self._writer = MLflowWriter(run)
+        self.logger.output_formats.append(self._writer)
+        self._saved_at = time.monotonic()
+        recovery = recover_in_background(spool_folder())
+        # The usual case, a store on this machine, is a matter of milliseconds; a slow server is not waited for.
+        recovery.join(0.5)
+        if self.verbose > 1:
+            print(f"MLflow:   run {run.run_id} at {shown(run.address)}", flush=True)
+
+    def _on_rollout_start(self) -> None:
+        # Here the model is as it was after its last update, for which the step count stands.
+        if self._run is not None and time.monotonic() - self._saved_at >= self._checkpoint_s:
+            self._save_model(self._run)
+            self._saved_at = time.monotonic()
+
+    def _on_step(self) -> bool:
+        for index, info in finished_episodes(self.locals):
+            if "avp_trajectory" in info:
+                self._last_episode = index, info["avp_trajectory"]
+        return True
+
+    def _on_training_end(self) -> None:
+        # rl_zoo3 calls this once more in a `finally`, whatever ended `learn()`.
+        self.close("FINISHED" if is_learning(self.model) else _status_of(sys.exc_info()[1]))
+
+    def _open_run(self) -> TrackedRun:
+        """The active run, the one to go on with, or a new one."""
+        configured = mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else DEFAULT_ADDRESS
+        active = mlflow.active_run()
+        if active is not None:
+            if self._tracking_uri not in (None, mlflow.get_tracking_uri()):
+                raise UsageError(
+                    f"tracking_uri {self._tracking_uri}: the active MLflow run {active.info.run_id} is kept at "
+                    f"{mlflow.get_tracking_uri()}; end that run or leave tracking_uri out"
+                )
+            return join_run(mlflow.get_tracking_uri(), active.info.run_id)
+        address = self._tracking_uri or configured
+        if self._wanted_run is not None:
+            return continue_run(address, self._wanted_run, offline=self._offline)
+        earlier = self._models_run() if self.model.num_timesteps > 0 else None
+        if earlier is not None and may_continue(address, earlier):
+            return continue_run(address, earlier, offline=self._offline)
+        name = self._new.name or run_name(self.model, self.training_env)
+        return start_run(address, replace(self._new, name=name), offline=self._offline)
+
+    def _models_run(self) -> str | None:
+        """The run that trained the model so far."""
+        return getattr(self.model, "avp_mlflow_run_id", None)
+
+    def _remember(self, run: TrackedRun) -> None:
+        """Keep the run's id, also within the model's .zip, so that a rollout can name the run of its policy."""
+        self.run_id = run.run_id
+        self.model.avp_mlflow_run_id = run.run_id  # type: ignore[attr-defined]
+
+    def _log_facts(self, run: TrackedRun, earlier: str | None) -> None:
+        env = self.training_env
+        params = hyperparameters(self.model) | task_settings(env) | flat(self._params)
+        tags = {"avp.kind": "training"} | scene_tags(env)
+        steps = self.model.num_timesteps
+        if earlier is not None and earlier != run.run_id:
+            tags["avp.continued_from"] = earlier
+        elif steps > 0:
+            tags["avp.resumed_at_step"] = str(steps)
+        run.params(params)
+        run.tags(tags | self._tags)
+        # MLflow keeps parameters as texts; here they are numbers, lists and truth values.
+        text = json.dumps(params, indent=1, default=str) + "\n"
+        run.save(PARAMS_FILE, lambda file: file.write_text(text, encoding="utf-8"))
+
+    def _write_pending_values(self) -> None:
+        """Values recorded after the logger's last dump: the last update's losses, or what an interruption cut off."""
+        if self._writer is not None:
+            self._writer.write(self.logger.name_to_value, self.logger.name_to_excluded, self.model.num_timesteps)
+
+    def _save_model(self, run: TrackedRun) -> None:
+        if self._log_model:
+            if (normalised := self.model.get_vec_normalize_env()) is not None:
+                run.save(STATISTICS_FILE, lambda file: normalised.save(str(file)))
+            run.save(MODEL_FILE, self.model.save)
+
+    def _save_trajectory(self, run: TrackedRun) -> None:
+        if self._last_episode is not None and self.training_env.has_attr("area"):
+            index, trajectory = self._last_episode
+            run.save(TRAJECTORY_FILE, lambda file: self._draw(file, index, trajectory))
+
+    def _draw(self, path: Path, index: int, trajectory: "Trajectory") -> None:
+        from avp_habitat.rollout.drawing import draw_trajectory
+        from avp_habitat.rollout.images import write_rgb
+
+        write_rgb(path, draw_trajectory(self.training_env.get_attr("area", index)[0], trajectory))
+
+    def _close_at_exit(self) -> None:
+        error = getattr(sys, "last_value", None)
+        self.close("KILLED" if error is None else _status_of(error))
+
+
+def _status_of(error: BaseException | None) -> Status:
+    interrupted = error is None or isinstance(error, (KeyboardInterrupt, SystemExit))
+    return "KILLED" if interrupted else "FAILED"

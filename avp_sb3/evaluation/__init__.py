@@ -1,0 +1,1 @@
+"""Evaluating policies over fixed episodes, and reporting it."""

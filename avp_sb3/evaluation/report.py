@@ -1,0 +1,231 @@
+"""The report of an evaluation: a table to print, and a folder with JSON, CSV and a plot of the curves."""
+
+import csv
+import json
+import os
+import platform
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avp_habitat.errors import AVPError, UsageError
+from avp_habitat.metrics import coverage_per_view, explained
+from avp_habitat.provenance import git_commit, installed_versions
+from avp_sb3.evaluation.policy import CONFIDENCE, PolicyResult, mean_and_half_width
+
+JSON_FILE, CSV_FILE, TABLE_FILE, PLOT_FILE = "evaluation.json", "episodes.csv", "table.md", "coverage.png"
+FORMAT, FORMAT_VERSION = "avp-evaluation", 1
+_VERSIONED = ("avp-suite", "stable-baselines3", "torch", "gymnasium", "numpy", "open3d", "scipy")
+_MACHINE = f"{platform.machine()}, {os.cpu_count()} cores"
+
+
+class ReportError(AVPError):
+    """A report that cannot be written or read."""
+
+
+@dataclass(frozen=True)
+class _Figure:
+    """How a figure is shown."""
+
+    title: str
+    """With its unit."""
+    scale: float = 1.0
+    """The shown number by the figure's own."""
+    digits: int = 1
+    """After the point."""
+
+
+_SHOWN = {
+    "coverage": _Figure("coverage [%]", 100),
+    "coverage_at_20": _Figure("coverage at 20 views [%]", 100),
+    "coverage_at_40": _Figure("coverage at 40 views [%]", 100),
+    "coverage_at_60": _Figure("coverage at 60 views [%]", 100),
+    "coverage_at_80": _Figure("coverage at 80 views [%]", 100),
+    "coverage_area": _Figure("coverage, mean over views [%]", 100),
+    "views": _Figure("views"),
+    "stopped": _Figure("ended by a stop [%]", 100),
+    "annd_m": _Figure("ANND [m]", digits=3),
+    "ei": _Figure("EI [%/view]", 100, 2),
+    "path_length_m": _Figure("path length [m]", digits=2),
+    "collisions": _Figure("collisions"),
+    "redundant_share": _Figure("redundant views [%]", 100),
+}
+
+LEGEND = f"{explained('coverage', 'ANND', 'EI', 'CpV', 'redundant views', 'stop')}; ±: half of the 95 % interval"
+"""One line to print below a table."""
+
+
+def table(results: Sequence[PolicyResult]) -> str:
+    """Figures by policy as a Markdown table: mean ± half the 95 % confidence interval; no ± for one episode."""
+    rows = [["figure", *(result.policy for result in results)], *([name, *row] for name, row in cells(results).items())]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    padded = [[cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in rows]
+    padded.insert(1, ["-" * width for width in widths])
+    return "\n".join(f"| {' | '.join(row)} |" for row in padded)
+
+
+def cells(results: Sequence[PolicyResult]) -> dict[str, list[str]]:
+    """By the title of a figure, its text for each policy."""
+    names = [name for name in _SHOWN if name in results[0].figures]
+    shown = {
+        _SHOWN[name].title: [_cell(_SHOWN[name], *mean_and_half_width(result.figures[name])) for result in results]
+        for name in names
+    }
+    episodes = [str(len(result.seeds)) for result in results]
+    return shown | {"CpV [%/view]": [f"{cpv(result):.2f}" for result in results], "episodes": episodes}
+
+
+def cpv(result: PolicyResult) -> float:
+    """Coverage per view in percent, of all episodes together."""
+    return coverage_per_view(result.figures["coverage"], result.figures["views"])
+
+
+def check_new(folder: Path) -> None:
+    """Refuse a folder that exists.
+
+    Raises:
+        UsageError: it does.
+    """
+    if folder.exists() or folder.is_symlink():
+        raise UsageError(f"--out {folder}: exists already; choose another name or remove it")
+
+
+def write_report(folder: Path, results: Sequence[PolicyResult], about: Mapping[str, Any]) -> Path:
+    """Write the folder; it appears only when it is whole.
+
+    Args:
+        folder: must not exist.
+        results: of at least one policy.
+        about: what was evaluated (command, scene, settings, …), as JSON; machine, commit and versions are added.
+
+    Raises:
+        UsageError: the folder exists.
+        ReportError: it cannot be written.
+    """
+    check_new(folder)
+    temporary = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
+    try:
+        temporary.mkdir(parents=True)
+        (temporary / JSON_FILE).write_text(_json(results, about), encoding="utf-8")
+        (temporary / TABLE_FILE).write_text(f"{table(results)}\n\n{LEGEND}\n", encoding="utf-8")
+        _write_csv(temporary / CSV_FILE, results)
+        _plot(temporary / PLOT_FILE, results)
+        temporary.rename(folder)
+    except OSError as error:
+        raise ReportError(f"--out {folder}: cannot write there: {error.strerror or error}") from None
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return folder
+
+
+def read_report(folder: str | Path) -> list[PolicyResult]:
+    """The results of a report, equal to those that were written.
+
+    Args:
+        folder: of the report.
+
+    Raises:
+        ReportError: its JSON is missing, unreadable or of another format.
+    """
+    path = Path(folder) / JSON_FILE
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+        found = (value["format"], value["format_version"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ReportError(f"{path}: expected a report of avp_sb3.evaluate, could not read it: {error!r}") from None
+    if found != (FORMAT, FORMAT_VERSION):
+        raise ReportError(f"{path}: expected {FORMAT} version {FORMAT_VERSION}, found {found[0]} version {found[1]}")
+    return [_result(entry) for entry in value["policies"]]
+
+
+def summary(result: PolicyResult) -> dict[str, dict[str, float | None]]:
+    """Mean and half the 95 % confidence interval by figure; None where one episode tells nothing of the spread."""
+    values = {name: mean_and_half_width(figures) for name, figures in result.figures.items()}
+    return {name: {"mean": float(mean), "half_width": _number(half)} for name, (mean, half) in values.items()}
+
+
+def _cell(figure: _Figure, mean: Any, half: Any) -> str:
+    text = f"{figure.scale * mean:.{figure.digits}f}"
+    return text if np.isnan(half) else f"{text} ± {figure.scale * half:.{figure.digits}f}"
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _json(results: Sequence[PolicyResult], about: Mapping[str, Any]) -> str:
+    value = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        **about,
+        "confidence": CONFIDENCE,
+        "commit": git_commit(),
+        "machine": _MACHINE,
+        "versions": installed_versions(_VERSIONED),
+        "policies": [_entry(result) for result in results],
+    }
+    return json.dumps(value, indent=2, allow_nan=False) + "\n"
+
+
+def _entry(result: PolicyResult) -> dict[str, Any]:
+    mean, half = mean_and_half_width(result.curve)
+    episodes = [
+        {
+            "seed": int(seed),
+            **{name: float(values[row]) for name, values in result.figures.items()},
+            "curve": result.curve[row].tolist(),
+        }
+        for row, seed in enumerate(result.seeds)
+    ]
+    return {
+        "policy": result.policy,
+        "observation": result.observation,
+        "training_run": result.training_run,
+        "summary": summary(result),
+        "curve": {"mean": mean.tolist(), "half_width": [_number(value) for value in half]},
+        "episodes": episodes,
+    }
+
+
+def _result(entry: Mapping[str, Any]) -> PolicyResult:
+    episodes = entry["episodes"]
+    names = [name for name in episodes[0] if name not in ("seed", "curve")]
+    return PolicyResult(
+        policy=entry["policy"],
+        seeds=np.array([episode["seed"] for episode in episodes]),
+        curve=np.array([episode["curve"] for episode in episodes]),
+        figures={name: np.array([episode[name] for episode in episodes]) for name in names},
+        training_run=entry["training_run"],
+        observation=entry["observation"],
+    )
+
+
+def _write_csv(path: Path, results: Sequence[PolicyResult]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["policy", "seed", *results[0].figures])
+        for result in results:
+            for seed, *values in zip(result.seeds, *result.figures.values(), strict=True):
+                writer.writerow([result.policy, seed, *(f"{value:.9g}" for value in values)])
+
+
+def _plot(path: Path, results: Sequence[PolicyResult]) -> None:
+    """Mean coverage by view with its confidence band."""
+    from matplotlib.figure import Figure
+
+    picture = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = picture.subplots()
+    for result in results:
+        mean, half = mean_and_half_width(100 * result.curve)
+        views = np.arange(1, len(mean) + 1)
+        (line,) = axes.plot(views, mean, label=f"{result.policy} ({len(result.seeds)} episodes)")
+        if not np.isnan(half).any():
+            axes.fill_between(views, mean - half, mean + half, color=line.get_color(), alpha=0.2, linewidth=0)
+    axes.set(xlabel="views", ylabel="coverage [%]", ylim=(0, 100), xlim=(1, None))
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower right", title="mean, 95 % confidence of the mean")
+    picture.savefig(path, dpi=150)

@@ -1,0 +1,1 @@
+"""The batched environment, and groups of it in processes."""
