@@ -1,36 +1,94 @@
-"""How far long work has come: a bar on a terminal, a line now and then in a file, a pipe or a notebook."""
+"""The frame of every command line: options as a dataclass, one-line errors, exit codes, Ctrl-C, progress."""
 
+import io
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from contextlib import redirect_stderr
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeVar, get_type_hints
 
 from tqdm import tqdm
 
-from avp_habitat.errors import AVPError
+from avp_habitat.errors import AVPError, UsageError
 
 INTERRUPTED = 130
+Options = TypeVar("Options")
+
+
+def parse(options: type[Options], argv: Sequence[str], *, prog: str | None = None) -> Options:
+    """Read a command line into a dataclass: tyro makes `--flag` from the field `flag`, and `--help` from docstrings.
+
+    A field without a default is required, `tyro.conf.Positional[Path]` has no flag, a nested dataclass gives its
+    fields as they are, without a prefix. The class's docstring is the command's description.
+
+    Args:
+        options: the dataclass. What its `__post_init__` refuses by "field: …" is told as "--field: …".
+        argv: the words of the command line.
+        prog: the program's name in the help; that of the running module when omitted.
+
+    Raises:
+        UsageError: the words do not fit, in one line.
+        SystemExit: after `--help`.
+    """
+    import tyro
+
+    said = io.StringIO()
+    how = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
+    try:
+        with redirect_stderr(said):
+            return tyro.cli(options, args=list(argv), prog=prog or _program(), config=how)
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise UsageError(_one_line(said.getvalue())) from None
+    except UsageError as error:
+        name, colon, rest = str(error).partition(":")
+        named = colon and name in _names(options)
+        raise (UsageError(f"--{name.replace('_', '-')}:{rest}") if named else error) from None
+
+
+def _program() -> str:
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    return os.path.basename(sys.argv[0]) if spec is None else f"python -m {spec.name.removesuffix('.__main__')}"
+
+
+def _names(options: Any) -> set[str]:
+    """The fields of a dataclass and of those within it."""
+    hints = get_type_hints(options)
+    nested = [hints[field.name] for field in fields(options) if is_dataclass(hints[field.name])]
+    return {field.name for field in fields(options)}.union(*map(_names, nested))
+
+
+def _one_line(box: str) -> str:
+    """What tyro says in a frame, without its title and what follows its first rule, as one line."""
+    said, *more = re.split("─{8,}", re.sub("[╭╮╰╯│]", " ", box.partition("\n")[2]))
+    near = re.search(r"Perhaps you meant:\s+(--[\w-]+)", more[0] if more else "")
+    return " ".join(said.split()) + (f"; did you mean {near[1]}?" if near else "; --help shows all options")
 
 
 def _interrupt(signum: int, _frame: object) -> None:
     raise KeyboardInterrupt(signal.Signals(signum).name)
 
 
-def run(main: Callable[[Sequence[str]], None], argv: Sequence[str] | None = None) -> int:
+def run(main: Callable[[Any], None], argv: Sequence[str] | None = None) -> int:
     """Run a command and turn its outcome into an exit code.
 
     Args:
-        main: takes the arguments (without the program's name).
+        main: takes the options that its annotation names (`parse`), or else the list of words.
         argv: the arguments; the process's own when omitted.
 
     Returns:
         0, or 1 (failure), 2 (usage), 130 (interrupted). A SIGTERM ends the command like Ctrl-C, so that
         temporary folders are removed.
     """
+    words = sys.argv[1:] if argv is None else argv
+    options = next(iter(get_type_hints(main).values()), None)
     previous = signal.signal(signal.SIGTERM, _interrupt)
     try:
-        main(sys.argv[1:] if argv is None else argv)
+        main(parse(options, words) if isinstance(options, type) and is_dataclass(options) else words)
     except AVPError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code

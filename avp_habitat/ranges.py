@@ -32,8 +32,9 @@ def hold_ranges(settings: Any) -> None:
     """
     for name, hint in _hints(type(settings)).items():
         value = getattr(settings, name)
-        if get_origin(hint) is Annotated:
-            kind, limits = get_args(hint)
+        limits = next((part for part in get_args(hint) if isinstance(part, Range)), None)
+        if get_origin(hint) is Annotated and limits is not None:
+            kind = get_args(hint)[0]
             object.__setattr__(settings, name, number(name, value, kind, limits))
         elif get_origin(hint) is Literal and value not in get_args(hint):
             raise unknown_name(name, str(value), get_args(hint))

@@ -1,16 +1,17 @@
 """`python -m avp_habitat.save_navmesh`: keep Habitat-Sim's NavMesh of a scene as a file, for both simulators."""
 
-import argparse
 import os
 import sys
 import tempfile
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import arg
 
 from avp_habitat import command
 from avp_habitat.errors import SceneError, UsageError
-from avp_habitat.scenes.location import HELP
-from avp_habitat.simulators.registry import add_up_option
+from avp_habitat.scenes.location import HELP, UP_HELP
 
 
 def save_navmesh(scene: str | Path, out: Path, *, gpu: int | None = None, up: str | None = None) -> float:
@@ -51,20 +52,23 @@ def save_navmesh(scene: str | Path, out: Path, *, gpu: int | None = None, up: st
     return simulator.area.area_m2
 
 
-def main(argv: Sequence[str]) -> None:
+@dataclass(frozen=True)
+class SaveNavmesh:
+    """Keep Habitat-Sim's NavMesh of a scene, computed for the task's agent, as a file.
+
+    Both simulators take it by --navmesh, so that agents walk in exactly the same area in both.
+    """
+
+    scene: Annotated[str, arg(help=HELP)]
+    out: Path
+    """The .navmesh file to write; must not exist."""
+    gpu: int | None = None
+    """CUDA device, -1 for none (omitted: the first one there is)."""
+    up: Annotated[Literal["y", "z"] | None, arg(help=UP_HELP)] = None
+
+
+def main(options: SaveNavmesh) -> None:
     """Write the file, say what it is for."""
-    parser = argparse.ArgumentParser(
-        prog="python -m avp_habitat.save_navmesh",
-        description="Keep Habitat-Sim's NavMesh of a scene, computed for the task's agent, as a file that both "
-        "simulators take by --navmesh, so that agents walk in exactly the same area in both.",
-    )
-    parser.add_argument("--scene", required=True, help=HELP)
-    parser.add_argument("--out", required=True, type=Path, help="the .navmesh file to write; must not exist")
-    parser.add_argument(
-        "--gpu", type=int, metavar="N", help="CUDA device, -1 for none (default: the first one there is)"
-    )
-    add_up_option(parser)
-    options = parser.parse_args(argv)
     area = save_navmesh(options.scene, options.out, gpu=options.gpu, up=options.up)
     print(f"{options.out}: {area:.2f} m² navigable; give it to both simulators by --navmesh {options.out}")
 

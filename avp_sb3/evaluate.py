@@ -86,7 +86,7 @@ def main(argv: Sequence[str]) -> None:
             policy,
             options.scene,
             settings,
-            simulator=choice.name,
+            simulator=choice.simulator,
             gpu=choice.gpu,
             navmesh=choice.navmesh,
             up=choice.up,

@@ -81,13 +81,13 @@ def _environment(options: argparse.Namespace, preset: Preset, choice: SimulatorC
     settings = TaskSettings(
         reward=options.reward,
         observation=options.observation,
-        lookup=not options.rays and choice.name == "raycast",
+        lookup=not options.rays and choice.simulator == "raycast",
         width=options.width,
         height=options.height,
     )
     common = {"agents": preset.n_envs, "settings": settings, "seed": options.seed}
-    common |= {"simulator": choice.name, "gpu": choice.gpu, "navmesh": choice.navmesh, "up": choice.up}
-    if options.workers is None and (len(options.scene) == 1 or choice.name not in ONE_PER_PROCESS):
+    common |= {"simulator": choice.simulator, "gpu": choice.gpu, "navmesh": choice.navmesh, "up": choice.up}
+    if options.workers is None and (len(options.scene) == 1 or choice.simulator not in ONE_PER_PROCESS):
         return VecMonitor(AVPVecEnv(options.scene, **common))
     return VecMonitor(AVPSubprocVecEnv(options.scene, workers=options.workers, **common))
 
@@ -156,7 +156,7 @@ def _callbacks(options: argparse.Namespace, choice: SimulatorChoice, tracking: A
     # First, so that scenes that cannot be opened leave no empty run behind.
     if options.eval_scene is not None:
         best = options.out.with_stem(f"{options.out.stem}-best")
-        where = {"simulator": choice.name, "gpu": choice.gpu, "up": choice.up}
+        where = {"simulator": choice.simulator, "gpu": choice.gpu, "up": choice.up}
         callbacks.append(EvaluationCallback(options.eval_scene, every=options.eval_every, best_model=best, **where))
     callbacks += [MetricsCallback(), tracking]
     if options.recording is not None:

@@ -26,12 +26,10 @@ import reporting
 from tqdm import tqdm
 
 from avp_habitat import command
-from avp_habitat.collect import Request, collect
+from avp_habitat.collect import Collect, collect
 from avp_habitat.errors import AVPError
-from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout.format import frame_name, read_rollout
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.task.settings import TaskSettings
 
 _REPEATS = 3
 _MEASURE = "--measure"
@@ -59,12 +57,14 @@ def main(argv: Sequence[str]) -> None:
         results["dataparser"] = []
         source = Path(name) / "source"
         collect(
-            Request(
+            Collect(
                 scene=options.scene,
                 policy="random",
                 out=source,
-                settings=TaskSettings(reward="coverage", budget=options.pictures),
-                camera=Intrinsics.from_hfov(options.width, options.height, hfov_deg=90.0),
+                reward="coverage",
+                budget=options.pictures,
+                width=options.width,
+                height=options.height,
             )
         )
         for frames in tqdm(options.frames, unit="folder", desc="parsing", disable=None):

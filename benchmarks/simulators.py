@@ -32,9 +32,10 @@ from avp_habitat.policies.frontier import FrontierPolicy
 from avp_habitat.policies.registry import check_policy
 from avp_habitat.poses import Intrinsics
 from avp_habitat.scenes.location import HELP as SCENES
+from avp_habitat.simulators.base import Simulator
 from avp_habitat.simulators.habitat import HabitatSimulator
 from avp_habitat.simulators.habitat.graphics import FIRST_DEVICE, choose_gpu, inspect_graphics
-from avp_habitat.simulators.registry import Simulator, make_simulator
+from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.observations import NAMES
 from avp_habitat.task.settings import ACTION_NAMES, MOVE_FORWARD, TaskSettings

@@ -26,7 +26,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta
 
-from avp_habitat import collect, command
+from avp_habitat import command
+from avp_habitat.collect import Collect, collect
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.poses import Intrinsics
 from avp_habitat.provenance import installed_versions
@@ -131,12 +132,9 @@ def measure(drawn: Drawn, work: Path, *, faults: bool) -> dict[str, Any]:
     folder = work / drawn.name
     if not folder.exists():
         settings = TaskSettings(budget=drawn.budget)
-        camera = Intrinsics.from_hfov(*drawn.size, hfov_deg=settings.hfov_deg)
-        collect.collect(
-            collect.Request(
-                drawn.scene, drawn.policy, folder, settings, seed=drawn.number, camera=camera, heldout=HELDOUT
-            )
-        )
+        width, height = drawn.size
+        options = Collect(drawn.scene, drawn.policy, folder, seed=drawn.number, width=width, height=height)
+        collect(options, settings=settings, heldout=HELDOUT)
     rollout, verdict = check_format(folder)
     if rollout is None:
         raise AVPError(f"{folder}: {verdict.text}")

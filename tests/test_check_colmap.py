@@ -3,7 +3,7 @@ import pycolmap
 import pytest
 from picture_walk import walk_poses, write_walk
 
-from avp_habitat.collect import Request, collect
+from avp_habitat.collect import Collect, collect
 from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.poses import habitat_to_opencv
 from avp_habitat.rollout.format import read_rollout
@@ -117,7 +117,7 @@ def test_a_failure_leaves_nothing_behind(walk, tmp_path, monkeypatch):
 def test_a_walk_through_a_real_room_is_read_back_with_small_errors(shared, tmp_path):
     scene = str(shared / "scenes" / "white_room.glb")
     settings = TaskSettings(budget=30)
-    collect(Request(scene=scene, policy="greedy", out=tmp_path / "r", settings=settings, seed=0, heldout=0))
+    collect(Collect(scene=scene, policy="greedy", out=tmp_path / "r"), settings=settings, heldout=0)
     rollout = read_rollout(tmp_path / "r")
     matches = match_pictures(rollout, progress=False)
     folder = export_colmap(rollout, tmp_path / "model", matches=matches, progress=False)

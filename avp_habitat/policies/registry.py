@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import PolicyError, UsageError, unknown_name
 from avp_habitat.policies.saved_model import SCHEDULES, NormalisedPolicy, check_harmless, statistics_of
-from avp_habitat.simulators.registry import Simulator
+from avp_habitat.simulators.base import Simulator
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
 

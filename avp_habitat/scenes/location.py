@@ -19,6 +19,8 @@ HELP = (
     f"{BUILTIN}SEED for a generated room"
 )
 """What a command line says of its option for scenes."""
+UP_HELP = "axis of a mesh file that points up (omitted: y, of Replica's files z)"
+"""And of its option `up`."""
 
 
 @dataclass(frozen=True)

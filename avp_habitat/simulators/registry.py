@@ -1,6 +1,5 @@
 """The simulators by name, made once per scene and process."""
 
-import argparse
 import gc
 import os
 import weakref
@@ -11,7 +10,7 @@ from typing import Any
 
 from avp_habitat.errors import SimulatorError, UsageError, unknown_name
 from avp_habitat.scenes.location import UPS
-from avp_habitat.simulators.base import Frames, Simulator
+from avp_habitat.simulators.base import Simulator
 
 SIMULATOR_NAMES = ("raycast", "habitat")
 _WITH_GPU = "habitat"
@@ -19,117 +18,68 @@ _WITH_GPU = "habitat"
 
 @dataclass(frozen=True)
 class SimulatorChoice:
-    """Which simulator opens a scene, and how."""
+    """Which simulator opens a scene, and how; also the options of a command that opens scenes.
 
-    name: str = "raycast"
-    """`raycast` or `habitat`."""
+    Raises:
+        UsageError: no such simulator, a number that is no device, or options of another simulator.
+    """
+
+    simulator: str = "raycast"
+    """raycast or habitat (Habitat-Sim)."""
     gpu: int | None = None
-    """Habitat's CUDA device; -1 for none, None for the first one that EGL offers."""
+    """CUDA device that habitat renders on, -1 for none (omitted: the first one that EGL offers)."""
     navmesh: Path | None = None
-    """File of the scene's NavMesh; computed when None."""
+    """The scene's .navmesh file (omitted: computed for the task's agent)."""
     up: str | None = None
-    """Axis of a mesh file that points up, `y` or `z`; None for Y, of Replica's files Z."""
+    """Axis of a mesh file that points up, y or z (omitted: y, of Replica's files z)."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot work."""
+        if self.navmesh is not None:
+            object.__setattr__(self, "navmesh", Path(self.navmesh))
+        if self.simulator not in SIMULATOR_NAMES:
+            raise unknown_name("simulator", self.simulator, SIMULATOR_NAMES)
+        if self.up not in (None, *UPS):
+            raise UsageError(f"up: expected {' or '.join(UPS)}, got {self.up!r}")
+        if self.gpu is not None and (isinstance(self.gpu, bool) or not isinstance(self.gpu, int) or self.gpu < -1):
+            raise UsageError(f"gpu: expected a CUDA device from 0, or -1 for none, got {self.gpu!r}")
+        if self.gpu is not None and self.simulator != _WITH_GPU:
+            raise UsageError(
+                f"gpu: is of the simulator {_WITH_GPU!r}, but {self.simulator!r} was chosen; leave it out, or choose "
+                f"{_WITH_GPU!r}"
+            )
 
     @classmethod
-    def of(
-        cls, name: str, *, gpu: int | None = None, navmesh: str | Path | None = None, up: str | None = None
-    ) -> "SimulatorChoice":
-        """The same from plain arguments, checked.
-
-        Raises:
-            UsageError: no such simulator, a number that is no device, or options of another simulator.
-        """
-        choice = cls(name, gpu, None if navmesh is None else Path(navmesh), up)
-        choice.check()
-        return choice
-
-    @classmethod
-    def unless_open(cls, simulator: object, **options: Any) -> "SimulatorChoice | None":
+    def by_name(cls, simulator: object, **options: Any) -> "SimulatorChoice | None":
         """The choice by name and options; None for simulators that are open already, which take no options.
 
         Raises:
-            UsageError: as `of`, or options beside an open simulator.
+            UsageError: as the class, or options beside an open simulator.
         """
         if isinstance(simulator, str):
-            return cls.of(simulator, **options)
+            return cls(simulator, **options)
         for option, value in options.items():
             if value is not None:
                 raise UsageError(f"{option}: expected none beside a simulator that is open already, got {value}")
         return None
 
-    def check(self, prefix: str = "") -> None:
-        """Refuse what cannot work.
 
-        Args:
-            prefix: of the options' names in the errors' texts: `--` on a command line.
-
-        Raises:
-            UsageError: no such simulator, a number that is no device, or options of another simulator.
-        """
-        if self.name not in SIMULATOR_NAMES:
-            raise unknown_name("simulator", self.name, SIMULATOR_NAMES)
-        if self.up not in (None, *UPS):
-            raise UsageError(f"{prefix}up: expected {' or '.join(UPS)}, got {self.up!r}")
-        if self.gpu is not None and (isinstance(self.gpu, bool) or not isinstance(self.gpu, int) or self.gpu < -1):
-            raise UsageError(f"{prefix}gpu: expected a CUDA device from 0, or -1 for none, got {self.gpu!r}")
-        if self.gpu is not None and self.name != _WITH_GPU:
-            raise UsageError(
-                f"{prefix}gpu: is of the simulator {_WITH_GPU!r}, but {self.name!r} was chosen; leave it out, or "
-                f"choose {_WITH_GPU!r}"
-            )
-
-
-def add_simulator_options(parser: argparse.ArgumentParser) -> None:
-    """Add `--simulator`, `--gpu`, `--navmesh` and `--up` to a command; `simulator_choice` reads them."""
-    names = ", ".join(SIMULATOR_NAMES)
-    parser.add_argument(
-        "--simulator", default="raycast", metavar="NAME", help=f"{names} (Habitat-Sim) (default: raycast)"
-    )
-    parser.add_argument(
-        "--gpu",
-        default=None,
-        type=int,
-        metavar="N",
-        help="CUDA device that habitat renders on, -1 for none (default: the first one there is)",
-    )
-    parser.add_argument(
-        "--navmesh",
-        default=None,
-        type=Path,
-        metavar="FILE",
-        help="the scene's .navmesh (default: computed for the task's agent)",
-    )
+def add_simulator_options(parser: Any) -> None:
+    """Until all commands are read by tyro."""
+    parser.add_argument("--simulator", default="raycast")
+    parser.add_argument("--gpu", default=None, type=int)
+    parser.add_argument("--navmesh", default=None, type=Path)
     add_up_option(parser)
 
 
-def add_up_option(parser: argparse.ArgumentParser) -> None:
-    """Add `--up` to a command that opens a scene."""
-    parser.add_argument(
-        "--up", choices=UPS, help="axis of a mesh file that points up (default: y, of Replica's files z)"
-    )
+def add_up_option(parser: Any) -> None:
+    """Until all commands are read by tyro."""
+    parser.add_argument("--up", choices=UPS)
 
 
-def simulator_choice(options: argparse.Namespace) -> SimulatorChoice:
-    """What the options of `add_simulator_options` say.
-
-    Raises:
-        UsageError: no such simulator, a number that is no device, or options of another simulator.
-    """
-    choice = SimulatorChoice(options.simulator, options.gpu, options.navmesh, options.up)
-    choice.check("--")
-    return choice
-
-
-__all__ = [
-    "ONE_PER_PROCESS",
-    "SIMULATOR_NAMES",
-    "Frames",
-    "Simulator",
-    "SimulatorChoice",
-    "make_simulator",
-    "open_scenes",
-    "open_simulator",
-]
+def simulator_choice(options: Any) -> SimulatorChoice:
+    """Until all commands are read by tyro."""
+    return SimulatorChoice(options.simulator, options.gpu, options.navmesh, options.up)
 
 
 def _raycast(scene: str, choice: SimulatorChoice) -> Simulator:
@@ -169,21 +119,20 @@ def make_simulator(name: str, scene: str | Path, **options: Any) -> Simulator:
         SceneError: the scene cannot be read, or nobody can stand in it.
         SimulatorError: the simulator is not installed or cannot run here, or this process has another one open.
     """
-    return open_simulator(SimulatorChoice.of(name, **options), scene)
+    return open_simulator(SimulatorChoice(name, **options), scene)
 
 
 def open_simulator(choice: SimulatorChoice, scene: str | Path) -> Simulator:
     """The chosen simulator on a scene; arguments and errors as of `make_simulator`."""
-    choice.check()
     scene = os.fspath(scene)
     path = Path(scene)
     # Not where a link leads: what a file refers to lies beside the link.
     key = (choice, os.path.abspath(path), path.stat().st_mtime) if path.is_file() else (choice, scene, 0.0)
     simulator = _shared.get(key)
     if simulator is None or _is_closed(simulator):
-        if choice.name in ONE_PER_PROCESS:
-            _check_alone(choice.name, scene)
-        simulator = _FACTORIES[choice.name](scene, choice)
+        if choice.simulator in ONE_PER_PROCESS:
+            _check_alone(choice.simulator, scene)
+        simulator = _FACTORIES[choice.simulator](scene, choice)
         _shared[key] = simulator
     return simulator
 
@@ -207,7 +156,7 @@ def _check_alone(name: str, scene: str) -> None:
 
 
 def _open_already(name: str) -> list[str]:
-    opened = [simulator for (choice, _, _), simulator in list(_shared.items()) if choice.name == name]
+    opened = [simulator for (choice, _, _), simulator in list(_shared.items()) if choice.simulator == name]
     return [simulator.scene for simulator in opened if not _is_closed(simulator)]
 
 

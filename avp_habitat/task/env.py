@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import UsageError, unknown_name
 from avp_habitat.poses import Intrinsics
-from avp_habitat.simulators.registry import Frames, Simulator, SimulatorChoice, open_simulator
+from avp_habitat.simulators.base import Frames, Simulator
+from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.observations import action_space, observation_space
 from avp_habitat.task.settings import ACTION_NAMES, TaskSettings
@@ -68,7 +69,7 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise unknown_name("render_mode", render_mode, RENDER_MODES)
         self.settings = _with_overrides(settings or TaskSettings(), overrides)
-        self.choice = SimulatorChoice.unless_open(simulator, gpu=gpu, navmesh=navmesh, up=up)
+        self.choice = SimulatorChoice.by_name(simulator, gpu=gpu, navmesh=navmesh, up=up)
         """How the simulator was chosen; None for one that was open already."""
         self.render_mode = render_mode
         self.observation_space = observation_space(self.settings.observation)
@@ -92,7 +93,7 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
             raise UsageError(f"change_scene: {self.choice.navmesh} is the NavMesh of {self.scene_name}; leave it out")
         # Freed before the next one is opened: a process can hold a single simulator of some kinds.
         del self.simulator, self.area, self._task
-        self._enter(scene, self.choice.name)
+        self._enter(scene, self.choice.simulator)
 
     @property
     def scene_name(self) -> str:

@@ -114,7 +114,7 @@ class EvaluationCallback(BaseCallback):
         self._every, self._episodes, self._seed = every, episodes, seed
         self._deterministic, self._at_start, self._score = deterministic, at_start, score
         self._settings = settings
-        self._choice = SimulatorChoice.of(simulator, gpu=gpu, navmesh=navmesh, up=up)
+        self._choice = SimulatorChoice(simulator, gpu=gpu, navmesh=navmesh, up=up)
         self._best = BestModel(best_model, score)
         self._due = 0
         self._evaluated_at: int | None = None
@@ -178,7 +178,7 @@ class EvaluationCallback(BaseCallback):
                     "settings, or an eval_env of its own kind"
                 )
             # Only rays can be looked up.
-            settings = replace(settings, lookup=settings.lookup and self._choice.name == "raycast")
+            settings = replace(settings, lookup=settings.lookup and self._choice.simulator == "raycast")
         return fixed_starts(self._scenes, self._choice, episodes=self._episodes, settings=settings)
 
     def _evaluate(self) -> None:

@@ -76,8 +76,8 @@ def fixed_starts(scenes: Sequence[str], choice: SimulatorChoice, *, episodes: in
     Raises:
         AVPError: as `AVPVecEnv` and `AVPSubprocVecEnv`.
     """
-    options = {"simulator": choice.name, "gpu": choice.gpu, "navmesh": choice.navmesh, "up": choice.up}
-    if choice.name not in ONE_PER_PROCESS:
+    options = {"simulator": choice.simulator, "gpu": choice.gpu, "navmesh": choice.navmesh, "up": choice.up}
+    if choice.simulator not in ONE_PER_PROCESS:
         return FixedStarts(scenes, episodes=episodes, settings=settings, **options)
     return FixedStartsInProcesses(list(scenes), agents=episodes * len(scenes), settings=settings, **options)
 

@@ -15,7 +15,7 @@ from avp_sb3.rerun.room import room_points, room_poses
 
 if TYPE_CHECKING:
     from avp_habitat.navigation.area import NavigableArea
-    from avp_habitat.simulators.registry import Frames
+    from avp_habitat.simulators.base import Frames
     from avp_habitat.task.trajectory import Trajectory
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field

@@ -14,7 +14,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics
 from avp_habitat.ranges import Range, number
-from avp_habitat.simulators.registry import ONE_PER_PROCESS, Frames, Simulator, SimulatorChoice, open_simulator
+from avp_habitat.simulators.base import Frames, Simulator
+from avp_habitat.simulators.registry import ONE_PER_PROCESS, SimulatorChoice, open_simulator
 from avp_habitat.surface.points import scene_surface
 from avp_habitat.task.env import step_info
 from avp_habitat.task.observations import action_space, observation_space
@@ -176,13 +177,13 @@ def _check_memory(agents: int, simulators: Sequence[Simulator], settings: TaskSe
 def _open(
     scene: str | Path | Sequence[str | Path], simulator: str | Simulator | Sequence[Simulator], **options: Any
 ) -> list[Simulator]:
-    choice = SimulatorChoice.unless_open(simulator, **options)
+    choice = SimulatorChoice.by_name(simulator, **options)
     if choice is None:
         return list(simulator) if isinstance(simulator, Sequence) else [simulator]  # type: ignore[list-item]
     scenes = scenes_given(scene, choice)
-    if len(scenes) > 1 and choice.name in ONE_PER_PROCESS:
+    if len(scenes) > 1 and choice.simulator in ONE_PER_PROCESS:
         raise UsageError(
-            f"AVPVecEnv: a process can hold one simulator of {choice.name!r}, expected one scene, got {len(scenes)}: "
+            f"AVPVecEnv: a process can hold one simulator of {choice.simulator!r}, expected one scene, got {len(scenes)}: "
             f"{', '.join(scenes)}; use AVPSubprocVecEnv, which gives each scene a process of its own"
         )
     return [open_simulator(choice, name) for name in scenes]

@@ -176,7 +176,7 @@ def _open(order: Order) -> "AVPVecEnv":
     return AVPVecEnv(
         order.scene,
         agents=order.agents,
-        simulator=choice.name,
+        simulator=choice.simulator,
         gpu=choice.gpu,
         navmesh=choice.navmesh,
         up=choice.up,

@@ -10,7 +10,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
 from avp_habitat.errors import UsageError
-from avp_habitat.simulators.registry import ONE_PER_PROCESS, Simulator, SimulatorChoice, open_simulator
+from avp_habitat.simulators.base import Simulator
+from avp_habitat.simulators.registry import ONE_PER_PROCESS, SimulatorChoice, open_simulator
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.settings import TaskSettings
 from avp_sb3.vec_env.batched import AVPVecEnv
@@ -111,9 +112,9 @@ def _simulators(envs: list[AVPEnv], scenes: Sequence[str | Path]) -> list[Simula
             f"set n_envs:{len(scenes)} and n_steps so that their product is PPO's buffer"
         )
     choice = envs[0].choice or SimulatorChoice(own[0].name)
-    if choice.name in ONE_PER_PROCESS and len(scenes) > 1:
+    if choice.simulator in ONE_PER_PROCESS and len(scenes) > 1:
         raise UsageError(
-            f"{_HOOK}: scenes: a process can hold one simulator of {choice.name!r}, got {len(scenes)} scenes; add "
+            f"{_HOOK}: scenes: a process can hold one simulator of {choice.simulator!r}, got {len(scenes)} scenes; add "
             f"--vec-env subproc and set n_envs:{len(scenes)}, with n_steps so that their product is PPO's buffer"
         )
     return [open_simulator(choice, scene) for scene in scenes]

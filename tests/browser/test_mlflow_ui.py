@@ -18,8 +18,7 @@ from PIL import Image
 import avp_nerfstudio.log
 import avp_sb3.evaluate
 from avp_habitat import command
-from avp_habitat.collect import Request, collect
-from avp_habitat.poses import Intrinsics
+from avp_habitat.collect import Collect, collect
 from avp_habitat.task.settings import TaskSettings
 from avp_habitat.tracking import compare
 from avp_habitat.tracking.comparison import COLUMNS, collect_runs, markdown
@@ -58,16 +57,7 @@ def store(tmp_path_factory):
 def reconstruct(policy, folder):
     settings = TaskSettings(budget=BUDGETS[policy], width=32, height=24)
     rollout = folder / policy
-    collect(
-        Request(
-            scene="builtin:0",
-            policy=policy,
-            out=rollout,
-            settings=settings,
-            camera=Intrinsics.from_hfov(48, 36, hfov_deg=90.0),
-            heldout=2,
-        )
-    )
+    collect(Collect(scene="builtin:0", policy=policy, out=rollout, width=48, height=36), settings=settings, heldout=2)
     config = tiny_config(rollout, folder / "nerf", iterations=12)
     config.experiment_name = policy
     assert command.run(avp_nerfstudio.log.main, [os.fspath(train(config)), "--pictures", "1"]) == 0
