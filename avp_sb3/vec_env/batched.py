@@ -183,7 +183,7 @@ def _open(
     scenes = scenes_given(scene, choice)
     if len(scenes) > 1 and choice.simulator in ONE_PER_PROCESS:
         raise UsageError(
-            f"AVPVecEnv: a process can hold one simulator of {choice.simulator!r}, expected one scene, got {len(scenes)}: "
+            f"AVPVecEnv: a process can hold one {choice.simulator!r} simulator, expected one scene, got {len(scenes)}: "
             f"{', '.join(scenes)}; use AVPSubprocVecEnv, which gives each scene a process of its own"
         )
     return [open_simulator(choice, name) for name in scenes]
