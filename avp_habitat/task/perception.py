@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.poses import Intrinsics, pixel_directions
-from avp_habitat.sight.coverage import candidates
+from avp_habitat.sight.rules import candidates
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.task.observations import depth_statistics
 from avp_habitat.task.settings import TaskSettings
