@@ -1,6 +1,6 @@
 """Likely causes of poses that the pictures contradict: the fault whose undoing makes them agree."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
 from typing import Any
@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from avp_habitat.poses import Intrinsics, camera_to_world, habitat_to_opencv, wrap_angle
+from avp_habitat.poses import Intrinsics, wrap_angle
+from avp_nerfstudio.check import hypotheses
 from avp_nerfstudio.check.pictures.frames import FreedFit, frame_shares, shift_and_turn
 from avp_nerfstudio.check.pictures.rays import Stacked, pair_medians, ray_errors
+from avp_nerfstudio.check.verdict import full_angles
 
 Float = NDArray[np.floating]
 
@@ -105,21 +107,18 @@ def _zoomed(intrinsics: Intrinsics, factor: float) -> Intrinsics:
 
 def _undone(poses: Float, intrinsics: Intrinsics, focal_factor: float) -> Iterator[tuple[str, Float, Intrinsics]]:
     """Each fault of a whole rollout: its words, and the poses and intrinsics without it."""
-    repairs: list[tuple[str, Callable[[Float], Float]]] = [
-        ("camera axes look like opencv written as habitat: y and z flipped", habitat_to_opencv),
-        ("the rotations look transposed", _transposed),
-        ("the poses look like world-to-camera written as camera-to-world", np.linalg.inv),
-        ("the poses look one frame ahead of their pictures: picture i was taken at pose i - 1", _later),
-        ("the poses look one frame behind their pictures: picture i was taken at pose i + 1", _earlier),
-        ("the pitch looks like degrees written as radians", _pitch_was_degrees),
-        ("the pitch looks like radians converted to radians once more", _pitch_was_radians),
-    ]
+    given = hypotheses.Cameras(poses, intrinsics, len(poses), np.ones(len(poses), bool))
     if abs(focal_factor - 1) >= FOCAL_TOLERANCE:
         yield _focal_words(intrinsics, focal_factor), poses, _zoomed(intrinsics, focal_factor)
-    for text, repair in repairs:
-        yield text, repair(poses), intrinsics
-    for camera in _sides_swapped(intrinsics):
-        yield "width and height look swapped in the intrinsics", poses, camera
+    degrees = hypotheses.degrees_taken_for_radians(given, _whole_degrees(poses), "all")
+    for found in (
+        *hypotheses.conventions(given, "all"),
+        *hypotheses.time_shifts(given),
+        *hypotheses.radians_taken_for_degrees(given, "all"),
+        degrees,
+        *hypotheses.swapped_intrinsics(given),
+    ):
+        yield found.cause, found.cameras.poses, found.cameras.intrinsics
 
 
 def _focal_words(intrinsics: Intrinsics, factor: float) -> str:
@@ -130,44 +129,11 @@ def _focal_words(intrinsics: Intrinsics, factor: float) -> str:
     )
 
 
-def _sides_swapped(intrinsics: Intrinsics) -> Iterator[Intrinsics]:
-    """The principal point and focal lengths exchanged; or also the focal length taken from the wrong side."""
-    swapped = replace(intrinsics, fx=intrinsics.fy, fy=intrinsics.fx, cx=intrinsics.cy, cy=intrinsics.cx)
-    yield swapped
-    yield _zoomed(swapped, intrinsics.width / intrinsics.height)
-    yield _zoomed(intrinsics, intrinsics.width / intrinsics.height)
-
-
-def _transposed(poses: Float) -> Float:
-    turned = poses.copy()
-    turned[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
-    return turned
-
-
-def _later(poses: Float) -> Float:
-    return np.concatenate([poses[:1], poses[:-1]])
-
-
-def _earlier(poses: Float) -> Float:
-    return np.concatenate([poses[1:], poses[-1:]])
-
-
-def _any_yaw_and_pitch(poses: Float) -> tuple[Float, Float]:
-    """Yaw and pitch in radians of upright cameras, the pitch over the full circle."""
-    return np.arctan2(-poses[:, 2, 0], poses[:, 0, 0]), np.arctan2(-poses[:, 1, 2], poses[:, 1, 1])
-
-
-def _pitch_was_degrees(poses: Float) -> Float:
-    """Poses whose pitch is the whole number of degrees that, read as radians, gives the pitch they have."""
-    yaw, pitch = _any_yaw_and_pitch(poses)
+def _whole_degrees(poses: Float) -> Float:
+    """`(n,)` the pitch in radians that is the whole number of degrees which, read as radians, gives the pitch now."""
     degrees = np.arange(-90, 91)
-    nearest = np.abs(wrap_angle(pitch[:, None] - degrees)).argmin(axis=1)
-    return camera_to_world(poses[:, :3, 3], yaw=yaw, pitch=np.radians(degrees[nearest]))
-
-
-def _pitch_was_radians(poses: Float) -> Float:
-    yaw, pitch = _any_yaw_and_pitch(poses)
-    return camera_to_world(poses[:, :3, 3], yaw=yaw, pitch=np.degrees(pitch))
+    nearest = np.abs(wrap_angle(full_angles(poses)[1][:, None] - degrees)).argmin(axis=1)
+    return np.radians(degrees[nearest])
 
 
 def _cause_in_frames(

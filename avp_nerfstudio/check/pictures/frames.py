@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from avp_habitat.poses import Intrinsics
-from avp_nerfstudio.check.cloud import rotation_matrix, rotation_vector
 from avp_nerfstudio.check.pictures.rays import Stacked, ray_errors
 
 Float = NDArray[np.floating]
@@ -144,12 +144,12 @@ def frames_off(
 
 def shift_and_turn(fit: FreedFit, pose: Float) -> tuple[float, float]:
     """Metres and degrees from the pose that fits to the given one."""
-    turned = rotation_vector(pose[:3, :3] @ fit.pose[:3, :3].T)
-    return float(np.linalg.norm(pose[:3, 3] - fit.pose[:3, 3])), float(np.degrees(np.linalg.norm(turned)))
+    turned = Rotation.from_matrix(pose[:3, :3] @ fit.pose[:3, :3].T).magnitude()
+    return float(np.linalg.norm(pose[:3, 3] - fit.pose[:3, 3])), float(np.degrees(turned))
 
 
 def _moved(pose: Float, change: Float) -> Float:
     moved = pose.copy()
     moved[:3, 3] += change[:3]
-    moved[:3, :3] = rotation_matrix(change[3:]) @ pose[:3, :3]
+    moved[:3, :3] = Rotation.from_rotvec(change[3:]).as_matrix() @ pose[:3, :3]
     return moved
