@@ -10,9 +10,8 @@ from wall_walk import TURNING, WALKING, write_wall
 from avp_habitat.poses import camera_to_world
 from avp_habitat.rollout.format import read_rollout
 from avp_nerfstudio.check.__main__ import Check, check
-from avp_nerfstudio.check.pictures.causes import best_focal_factor
+from avp_nerfstudio.check.pictures.causes import best_focal_factor, gain_limit
 from avp_nerfstudio.check.pictures.evidence import check_pictures, judge
-from avp_nerfstudio.check.pictures.frames import gain_limit
 from avp_nerfstudio.check.pictures.matching import match_pictures
 from avp_nerfstudio.check.pictures.rays import Stacked, estimate_relative_poses
 
