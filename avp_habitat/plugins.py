@@ -21,8 +21,6 @@ KINDS = {
     "avp.metrics": "metric",
 }
 """What is chosen by name, by the group of entry points in which other distributions register theirs."""
-OWN = "MODULE:OBJECT"
-"""How an error's text calls an object that is named by its place."""
 
 
 def find(group: str, name: Any, known: Mapping[str, Any]) -> Any:
@@ -50,7 +48,7 @@ def find(group: str, name: Any, known: Mapping[str, Any]) -> Any:
         return _load(kind, name, found) if isinstance(found, str) else found
     if ":" in name:
         return _load(kind, name, name)
-    raise unknown_name(kind, name, [*names(group, known), OWN])
+    raise unknown_name(kind, name, names(group, known))
 
 
 def declares(**facts: Any) -> Callable[[Function], Function]:
