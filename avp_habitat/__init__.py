@@ -11,9 +11,13 @@ import gymnasium
 
 if TYPE_CHECKING:
     from avp_habitat.collect import Collect
+    from avp_habitat.navigation.area import NavigableArea
     from avp_habitat.policies.registry import make_policy
+    from avp_habitat.poses import pixel_directions
     from avp_habitat.recording import RecordRollout
     from avp_habitat.rollout.format import Rollout, read_rollout
+    from avp_habitat.scenes.location import Frame
+    from avp_habitat.sight.coverage import visible_in_depth
     from avp_habitat.simulators.base import Frames, Simulator, SingleRays
     from avp_habitat.simulators.registry import make_simulator
     from avp_habitat.task.agent_view import AgentView, agent_views
@@ -27,7 +31,9 @@ __all__ = [
     "AgentView",
     "Agents",
     "Collect",
+    "Frame",
     "Frames",
+    "NavigableArea",
     "RecordRollout",
     "RewardConstants",
     "Rollout",
@@ -39,8 +45,10 @@ __all__ = [
     "make_policy",
     "make_simulator",
     "numbers",
+    "pixel_directions",
     "read_rollout",
     "reward",
+    "visible_in_depth",
 ]
 
 _HOME = {
@@ -48,7 +56,9 @@ _HOME = {
     "AgentView": "task.agent_view",
     "Agents": "task.observations",
     "Collect": "collect",
+    "Frame": "scenes.location",
     "Frames": "simulators.base",
+    "NavigableArea": "navigation.area",
     "RecordRollout": "recording",
     "RewardConstants": "task.rewards",
     "Rollout": "rollout.format",
@@ -60,8 +70,10 @@ _HOME = {
     "make_policy": "policies.registry",
     "make_simulator": "simulators.registry",
     "numbers": "task.observations",
+    "pixel_directions": "poses",
     "read_rollout": "rollout.format",
     "reward": "task.rewards",
+    "visible_in_depth": "sight.coverage",
 }
 ENV_ID = "AVP-v0"
 
