@@ -1,9 +1,10 @@
 """The settings of the task, with the design's defaults."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from avp_habitat.errors import UsageError
+from avp_habitat.metrics import find_metrics
 from avp_habitat.poses import Intrinsics
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.task.rewards import RewardConstants, check_reward
@@ -51,6 +52,9 @@ class TaskSettings:
     observation: Literal["numbers", "map", "surface_map"] = "numbers"
     """numbers: the twelve of the design. map: these, whether C ≥ τ, and a map of what was seen of the floor around the
     agent. surface_map: these, and maps of what was seen of walls, furniture and ceiling."""
+    metrics: tuple[Any, ...] = ()
+    """Further metrics, of episodes and of rollouts: `module:function`, another distribution's, or the functions
+    themselves (`metrics.metric`). Their values stand beside the suite's own wherever these are logged."""
     lookup: bool = False
     """Whether views are looked up in tables of the scene instead of casting all their rays: faster, for training."""
 
@@ -58,6 +62,9 @@ class TaskSettings:
         """Refuse what cannot work, by the option's name."""
         check_reward(self.reward)
         hold_ranges(self)
+        metrics = (self.metrics,) if isinstance(self.metrics, str) else tuple(self.metrics)
+        object.__setattr__(self, "metrics", metrics)
+        find_metrics(metrics)
         if self.collision_m >= self.forward_m:
             raise UsageError(
                 f"collision_m: expected less than forward_m ({self.forward_m:g}), or every move is a collision, got "
