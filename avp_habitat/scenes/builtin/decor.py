@@ -3,7 +3,7 @@
 import numpy as np
 
 from avp_habitat.scenes.builtin.kit import Kit, Lamp, Piece
-from avp_habitat.scenes.builtin.random import Dice
+from avp_habitat.scenes.builtin.noise import Random
 from avp_habitat.scenes.builtin.shapes import Surface, box, cylinder, lathe, sheet
 
 
@@ -14,9 +14,9 @@ def rug(kit: Kit, width: float, depth: float) -> Piece:
     return Piece("rug", made, width, depth, 0.014)
 
 
-def floor_lamp(kit: Kit, dice: Dice) -> Piece:
+def floor_lamp(kit: Kit, rng: Random) -> Piece:
     """A standing lamp with a cloth shade."""
-    high = dice.number(1.55, 1.75)
+    high = rng.uniform(1.55, 1.75)
     made = cylinder(0.15, 0.0, 0.025, (0, 0, 0), kit.metal, 18)
     made += lathe([(0.014, high - 0.1), (0.014, 0.025)], (0, 0, 0), kit.metal, segments=8)
     made += lathe([(0.15, high), (0.2, high - 0.3)], (0, 0, 0), kit.lampshade, segments=18, open_ended=True)
@@ -24,12 +24,12 @@ def floor_lamp(kit: Kit, dice: Dice) -> Piece:
     return Piece("floor lamp", made, 0.42, 0.42, high, (Lamp((0.0, high - 0.2, 0.0), 0.3),))
 
 
-def pendant(kit: Kit, dice: Dice, ceiling: float, bottom: float) -> Piece:
+def pendant(kit: Kit, rng: Random, ceiling: float, bottom: float) -> Piece:
     """A lamp that hangs from the ceiling; all heights in metres above the floor."""
     shade_high = 0.24
     made = cylinder(0.05, ceiling - 0.03, ceiling - 0.002, (0, 0, 0), kit.metal, 12)
     made += lathe([(0.006, ceiling - 0.03), (0.006, bottom + shade_high)], (0, 0, 0), kit.metal, segments=6)
-    profile = dice.pick(
+    profile = rng.choice(
         (
             [(0.03, 0.24), (0.12, 0.2), (0.2, 0.1), (0.23, 0.0)],
             [(0.16, 0.24), (0.25, 0.0)],
@@ -58,28 +58,28 @@ def _leaf(kit: Kit, root: np.ndarray, yaw: float, rise: float, length: float, wi
     return sheet(points, uv, kit.leaf, both_sides=True)
 
 
-def plant(kit: Kit, dice: Dice) -> Piece:
+def plant(kit: Kit, rng: Random) -> Piece:
     """A pot with a bushy plant."""
-    high, spread = dice.number(0.9, 1.5), 0.34
-    pot = dice.pick([*kit.ceramics, kit.wicker])
+    high, spread = rng.uniform(0.9, 1.5), 0.34
+    pot = rng.choice([*kit.ceramics, kit.wicker])
     pot_high = 0.36
     made = lathe([(0.17, pot_high), (0.19, pot_high), (0.17, 0.1), (0.14, 0.0)], (0, 0, 0), pot, segments=16)
     made += lathe([(0.001, pot_high - 0.03), (0.17, pot_high - 0.03)], (0, 0, 0), kit.dark_wood, segments=12)
     made += lathe([(0.012, high - 0.25), (0.02, pot_high - 0.05)], (0, 0, 0), kit.dark_wood, segments=6)
-    count = dice.whole(16, 22)
+    count = rng.integer(16, 22)
     for index in range(count):
         level = index / count
         root = np.array([0.0, pot_high + (high - 0.3 - pot_high) * level, 0.0])
-        length = spread * dice.number(0.72, 0.98) * (1 - 0.25 * level)
+        length = spread * rng.uniform(0.72, 0.98) * (1 - 0.25 * level)
         made += _leaf(
-            kit, root, index * 2.4 + dice.number(-0.2, 0.2), dice.number(0.28, 0.5), length, dice.number(0.11, 0.17)
+            kit, root, index * 2.4 + rng.uniform(-0.2, 0.2), rng.uniform(0.28, 0.5), length, rng.uniform(0.11, 0.17)
         )
     return Piece("plant", made, 0.72, 0.72, high + 0.05)
 
 
-def picture(kit: Kit, dice: Dice, width: float, height: float) -> list[Surface]:
+def picture(kit: Kit, rng: Random, width: float, height: float) -> list[Surface]:
     """A framed painting whose back touches z = 0, centred at the origin."""
-    frame = dice.pick((kit.dark_wood, kit.wood, kit.black, kit.trim, kit.metal))
+    frame = rng.choice((kit.dark_wood, kit.wood, kit.black, kit.trim, kit.metal))
     bar, deep = 0.035, 0.03
     made: list[Surface] = []
     for side in (-1, 1):

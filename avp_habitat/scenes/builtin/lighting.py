@@ -148,6 +148,6 @@ def bake(shell: Shell, surfaces: list[Surface], lamps: list[Lamp]) -> list[NDArr
     for surface in surfaces:
         end = start + len(surface.vertices)
         shown = np.ones((end - start, 3), np.float32) if surface.material.glows else light[start:end]
-        colours.append(np.clip(shown * np.asarray(surface.material.tint, np.float32), 0, 1))
+        colours.append(np.clip(shown, 0, 1))
         start = end
     return colours

@@ -11,7 +11,7 @@ from avp_habitat.scenes.builtin.floorplan import Floor, Placed, places, stand_at
 from avp_habitat.scenes.builtin.groups import Arrange, Member
 from avp_habitat.scenes.builtin.kit import Kit, Lamp, Piece, shifted
 from avp_habitat.scenes.builtin.lighting import bake
-from avp_habitat.scenes.builtin.random import Dice
+from avp_habitat.scenes.builtin.noise import Random
 from avp_habitat.scenes.builtin.shapes import Surface, joined
 from avp_habitat.scenes.builtin.shell import Shell, Wall, build_shell, plan_shell
 from avp_habitat.scenes.mesh import TexturedMesh, merge
@@ -22,36 +22,36 @@ MIDDLE_M = 1.6
 """Height at which the middle of a picture hangs."""
 
 
-def _hang_one(floor: Floor, dice: Dice, kit: Kit, wall: Wall, right: float, *, clock: bool) -> bool:
+def _hang_one(floor: Floor, rng: Random, kit: Kit, wall: Wall, right: float, *, clock: bool) -> bool:
     """Hang a picture or clock at a place on a wall if nothing is in its way."""
-    width, height = (0.34, 0.34) if clock else dice.pick(PICTURES)
+    width, height = (0.34, 0.34) if clock else rng.choice(PICTURES)
     low, high = MIDDLE_M - height / 2, MIDDLE_M + height / 2
     stand = stand_at(Member(Piece("", [], width, 0.06, high), 0.0, 0.03), wall, right, 0.0)
     if not floor.is_free(stand, low, high, 0.1):
         return False
-    surfaces = decor.clock(kit) if clock else decor.picture(kit, dice, width, height)
+    surfaces = decor.clock(kit) if clock else decor.picture(kit, rng, width, height)
     piece = Piece("clock" if clock else "picture", shifted(surfaces, 0.0, MIDDLE_M, -0.03), width, 0.06, high)
     floor.hang(Placed(piece, stand.axes, stand.position, stand.footprint), low, high)
     return True
 
 
-def hang_pictures(floor: Floor, dice: Dice, kit: Kit) -> None:
+def hang_pictures(floor: Floor, rng: Random, kit: Kit) -> None:
     """Pictures on every wall that has room for them, one clock in some rooms."""
-    clock = dice.chance(0.6)
-    for wall in dice.shuffled(floor.shell.walls):
+    clock = rng.chance(0.6)
+    for wall in rng.shuffled(floor.shell.walls):
         wanted = 3 if wall.length > 3 else 1
-        for right in dice.shuffled(places(0.5, wall.length - 0.4, 0.2)):
-            if wanted and _hang_one(floor, dice, kit, wall, right, clock=clock):
+        for right in rng.shuffled(places(0.5, wall.length - 0.4, 0.2)):
+            if wanted and _hang_one(floor, rng, kit, wall, right, clock=clock):
                 wanted, clock = wanted - 1, False
 
 
-def hang_lamp(floor: Floor, dice: Dice, kit: Kit) -> None:
+def hang_lamp(floor: Floor, rng: Random, kit: Kit) -> None:
     """A pendant above the dining table, or where the room is open."""
     shell = floor.shell
     tables = [stand.position for stand in floor.placed if stand.piece.kind == "dining table"]
     x0, z0, x1, z1 = shell.bounds
     bottom = min(2.1, round(shell.ceiling - 0.62, 2))
-    piece = decor.pendant(kit, dice, shell.ceiling, bottom)
+    piece = decor.pendant(kit, rng, shell.ceiling, bottom)
     half = piece.width / 2
     for x, z in tables or [((x0 + x1) / 2 + 0.1, (z0 + z1) / 2), (x0 + 1.2, z0 + 1.2), (x1 - 1.2, z1 - 1.2)]:
         stand = Placed(piece, np.eye(3), (x, z), (x - half, z - half, x + half, z + half))
@@ -76,89 +76,89 @@ def _put(floor: Floor, arrange: Arrange, spots: Iterable[Spot], least_share: flo
     return False
 
 
-def _at_walls(floor: Floor, dice: Dice) -> Iterator[Spot]:
+def _at_walls(floor: Floor, rng: Random) -> Iterator[Spot]:
     """Places along all walls in random order."""
-    for wall in dice.shuffled(floor.shell.walls):
-        for right in dice.shuffled(places(0.3, wall.length - 0.3, 0.2)):
+    for wall in rng.shuffled(floor.shell.walls):
+        for right in rng.shuffled(places(0.3, wall.length - 0.3, 0.2)):
             yield wall, right, 0.0
 
 
-def _in_corners(floor: Floor, dice: Dice, distance: float) -> Iterator[Spot]:
+def _in_corners(floor: Floor, rng: Random, distance: float) -> Iterator[Spot]:
     """Places at walls, a distance in metres from their ends, in random order."""
-    for wall in dice.shuffled(floor.shell.walls):
-        for right in dice.shuffled([distance, wall.length - distance]):
+    for wall in rng.shuffled(floor.shell.walls):
+        for right in rng.shuffled([distance, wall.length - distance]):
             yield wall, right, 0.0
 
 
-def _anywhere(floor: Floor, dice: Dice) -> Iterator[Spot]:
+def _anywhere(floor: Floor, rng: Random) -> Iterator[Spot]:
     """Places in the open floor in random order."""
-    for wall in dice.shuffled(floor.shell.walls):
+    for wall in rng.shuffled(floor.shell.walls):
         spots = [(r, i) for r in places(0.6, wall.length - 0.5, 0.3) for i in places(0.1, 4.0, 0.3)]
-        for right, inwards in dice.shuffled(spots)[:120]:
+        for right, inwards in rng.shuffled(spots)[:120]:
             yield wall, right, inwards
 
 
-def _across(floor: Floor, dice: Dice) -> Iterator[Spot]:
+def _across(floor: Floor, rng: Random) -> Iterator[Spot]:
     """Places at long walls, away from their ends, in random order."""
-    for wall in dice.shuffled([wall for wall in floor.shell.walls if wall.length >= 3.0]):
-        for share in dice.shuffled([0.3, 0.36, 0.43, 0.5, 0.57, 0.64, 0.7]):
+    for wall in rng.shuffled([wall for wall in floor.shell.walls if wall.length >= 3.0]):
+        for share in rng.shuffled([0.3, 0.36, 0.43, 0.5, 0.57, 0.64, 0.7]):
             yield wall, round(wall.length * share, 2), 0.0
 
 
-def _storage(kit: Kit, dice: Dice) -> list[Arrange]:
+def _storage(kit: Kit, rng: Random) -> list[Arrange]:
     """Tall and low furniture for walls, the second shelf and chest last."""
     first = [
-        groups.against_wall(storage.bookshelf(kit, dice), 0.55),
-        groups.against_wall(storage.wardrobe(kit, dice), 0.6),
-        groups.against_wall(storage.drawers(kit, dice), 0.5),
+        groups.against_wall(storage.bookshelf(kit, rng), 0.55),
+        groups.against_wall(storage.wardrobe(kit, rng), 0.6),
+        groups.against_wall(storage.drawers(kit, rng), 0.5),
     ]
     second = [
-        groups.against_wall(storage.bookshelf(kit, dice), 0.55),
-        groups.against_wall(storage.drawers(kit, dice), 0.5),
+        groups.against_wall(storage.bookshelf(kit, rng), 0.55),
+        groups.against_wall(storage.drawers(kit, rng), 0.5),
     ]
-    return dice.shuffled(first) + second
+    return rng.shuffled(first) + second
 
 
-def _put_living(floor: Floor, dice: Dice, kit: Kit) -> bool:
+def _put_living(floor: Floor, rng: Random, kit: Kit) -> bool:
     """Sofa, television and what belongs to them, as much as fits."""
-    return any(_put(floor, arrange, _at_walls(floor, dice), MAIN) for arrange in groups.living(kit, dice))
+    return any(_put(floor, arrange, _at_walls(floor, rng), MAIN) for arrange in groups.living(kit, rng))
 
 
-def _put_main_groups(floor: Floor, dice: Dice, kit: Kit) -> None:
+def _put_main_groups(floor: Floor, rng: Random, kit: Kit) -> None:
     """What the room is for, by its size, and what parts it."""
     area = floor.shell.floor_area
-    sleeps = dice.chance(0.6 if area > 22 else 0.4)
+    sleeps = rng.chance(0.6 if area > 22 else 0.4)
     sits = area > 20 or not sleeps
-    sits = sits and _put_living(floor, dice, kit)
-    sleeps = (sleeps or not sits) and _put(floor, groups.sleeping(kit, dice), _at_walls(floor, dice), MAIN)
+    sits = sits and _put_living(floor, rng, kit)
+    sleeps = (sleeps or not sits) and _put(floor, groups.sleeping(kit, rng), _at_walls(floor, rng), MAIN)
     if not sits and not sleeps:
-        sits = _put_living(floor, dice, kit)
+        sits = _put_living(floor, rng, kit)
     if not (sits and sleeps) or area > 30:
-        _put(floor, groups.dining(kit, dice), _anywhere(floor, dice), MAIN)
-    any(_put(floor, arrange, _across(floor, dice), MAIN) for arrange in groups.divider(kit, dice, floor.shell.ceiling))
+        _put(floor, groups.dining(kit, rng), _anywhere(floor, rng), MAIN)
+    any(_put(floor, arrange, _across(floor, rng), MAIN) for arrange in groups.divider(kit, rng, floor.shell.ceiling))
 
 
-def _put_the_rest(floor: Floor, dice: Dice, kit: Kit) -> None:
+def _put_the_rest(floor: Floor, rng: Random, kit: Kit) -> None:
     """Desk, storage, a place to read, and what fills corners, as long as the floor stays walkable."""
-    first, *rest = _storage(kit, dice)
-    for arrange in (groups.working(kit, dice), first):
-        _put(floor, arrange, _at_walls(floor, dice), EXTRA)
-    any(_put(floor, arrange, _at_walls(floor, dice), EXTRA) for arrange in groups.reading(kit, dice))
+    first, *rest = _storage(kit, rng)
+    for arrange in (groups.working(kit, rng), first):
+        _put(floor, arrange, _at_walls(floor, rng), EXTRA)
+    any(_put(floor, arrange, _at_walls(floor, rng), EXTRA) for arrange in groups.reading(kit, rng))
     for arrange in rest:
-        _put(floor, arrange, _at_walls(floor, dice), EXTRA)
+        _put(floor, arrange, _at_walls(floor, rng), EXTRA)
     for _ in range(2):
-        _put(floor, groups.against_wall(decor.plant(kit, dice), 0.0), _in_corners(floor, dice, 0.42), SMALL)
+        _put(floor, groups.against_wall(decor.plant(kit, rng), 0.0), _in_corners(floor, rng, 0.42), SMALL)
     if sum(stand.piece.kind == "side table" for stand in floor.placed) < 2:
-        _put(floor, groups.against_wall(seating.side_table(kit, dice), 0.3), _at_walls(floor, dice), SMALL)
+        _put(floor, groups.against_wall(seating.side_table(kit, rng), 0.3), _at_walls(floor, rng), SMALL)
 
 
-def furnish(shell: Shell, dice: Dice, kit: Kit) -> list[Placed]:
+def furnish(shell: Shell, rng: Random, kit: Kit) -> list[Placed]:
     """Furniture of a room, none of it in another's place, the door free, the floor walkable and in one part."""
     floor = Floor(shell)
-    _put_main_groups(floor, dice, kit)
-    _put_the_rest(floor, dice, kit)
-    hang_lamp(floor, dice, kit)
-    hang_pictures(floor, dice, kit)
+    _put_main_groups(floor, rng, kit)
+    _put_the_rest(floor, rng, kit)
+    hang_lamp(floor, rng, kit)
+    hang_pictures(floor, rng, kit)
     return floor.placed
 
 
@@ -182,8 +182,8 @@ def plan_room(seed: int) -> tuple[Shell, list[Placed]]:
         UsageError: the seed is not a whole number of 0 or greater.
     """
     seed = _checked(seed)
-    shell = plan_shell(Dice(seed, 1))
-    return shell, furnish(shell, Dice(seed, 2), Kit(seed))
+    shell = plan_shell(Random(seed, 1))
+    return shell, furnish(shell, Random(seed, 2), Kit(seed))
 
 
 def _snapped(values: np.ndarray) -> np.ndarray:
@@ -222,9 +222,9 @@ def generate_room(seed: int) -> TexturedMesh:
     """
     seed = _checked(seed)
     kit = Kit(seed)
-    shell = plan_shell(Dice(seed, 1))
-    placed = furnish(shell, Dice(seed, 2), kit)
-    surfaces = build_shell(kit, Dice(seed, 3), shell)
+    shell = plan_shell(Random(seed, 1))
+    placed = furnish(shell, Random(seed, 2), kit)
+    surfaces = build_shell(kit, Random(seed, 3), shell)
     lamps = []
     for stand in placed:
         surfaces += stand.surfaces()

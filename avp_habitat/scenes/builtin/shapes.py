@@ -8,6 +8,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from avp_habitat.scenes.builtin.noise import Picture
+
 Float = NDArray[np.floating]
 Vector = tuple[float, float, float]
 Rectangle = tuple[float, float, float, float]
@@ -15,28 +17,23 @@ Rectangle = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """A picture and how it lies on a surface."""
+    """A picture, the metres that it spans along u and v, and whether it glows, so that baked light leaves it alone."""
 
-    paint: Callable[[], NDArray[np.uint8]]
-    """Makes the picture, `(height, width, 3)` sRGB; called once, when the picture is first needed."""
+    paint: Callable[[], Picture]
+    """Makes the picture; called once, when it is first needed."""
     width_m: float
-    """Metres that the picture spans along u."""
     height_m: float
-    """Metres that the picture spans along v."""
-    tint: Vector = (1.0, 1.0, 1.0)
-    """Multiplies the picture."""
     glows: bool = False
-    """Whether the surface shines by itself, so that baked light leaves it alone."""
 
     @cached_property
-    def picture(self) -> NDArray[np.uint8]:
+    def picture(self) -> Picture:
         """`(height, width, 3)` sRGB."""
         return self.paint()
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles of one material."""
+    """Triangles of one material, counter-clockwise as seen from outside."""
 
     vertices: Float
     """`(v, 3)` metres."""
@@ -45,7 +42,7 @@ class Surface:
     uv: Float
     """`(v, 2)` texture coordinates, v down."""
     triangles: NDArray[np.int32]
-    """`(t, 3)` counter-clockwise as seen from outside."""
+    """`(t, 3)`."""
     material: Material
 
 

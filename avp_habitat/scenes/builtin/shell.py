@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.scenes.builtin.kit import Kit
-from avp_habitat.scenes.builtin.random import Dice
+from avp_habitat.scenes.builtin.noise import Random
 from avp_habitat.scenes.builtin.shapes import Material, Surface, box, moved, panel, sheet
 
 Point = tuple[float, float]
@@ -116,15 +116,15 @@ class Shell:
         return round(depth, 2)
 
 
-def _outline(dice: Dice) -> tuple[tuple[Point, ...], tuple[float, float, float, float] | None]:
-    width, depth = dice.number(4.0, 8.0), dice.number(3.5, 6.5)
+def _outline(rng: Random) -> tuple[tuple[Point, ...], tuple[float, float, float, float] | None]:
+    width, depth = rng.uniform(4.0, 8.0), rng.uniform(3.5, 6.5)
     x0, z0 = -round(width / 2, 2), -round(depth / 2, 2)
     x1, z1 = round(x0 + width, 2), round(z0 + depth, 2)
-    if width < 5.2 or depth < 4.6 or dice.chance(0.4):
+    if width < 5.2 or depth < 4.6 or rng.chance(0.4):
         return ((x0, z0), (x1, z0), (x1, z1), (x0, z1)), None
-    wide = min(round(width * dice.number(0.32, 0.5), 2), width - 2.6)
-    deep = min(round(depth * dice.number(0.32, 0.5), 2), depth - 2.4)
-    corner = dice.whole(0, 3)
+    wide = min(round(width * rng.uniform(0.32, 0.5), 2), width - 2.6)
+    deep = min(round(depth * rng.uniform(0.32, 0.5), 2), depth - 2.4)
+    corner = rng.integer(0, 3)
     if corner == 0:
         xa, za = round(x0 + wide, 2), round(z0 + deep, 2)
         return ((xa, z0), (x1, z0), (x1, z1), (x0, z1), (x0, za), (xa, za)), (x0, z0, xa, za)
@@ -138,26 +138,26 @@ def _outline(dice: Dice) -> tuple[tuple[Point, ...], tuple[float, float, float, 
     return ((x0, z0), (x1, z0), (x1, z1), (xa, z1), (xa, za), (x0, za)), (x0, za, xa, z1)
 
 
-def _window(dice: Dice, wall: int, length: float, ceiling: float) -> Opening:
-    width = min(dice.number(1.1, 2.0), length - 1.4)
-    left = round((length - width) * dice.number(0.35, 0.65), 2)
-    bottom = dice.pick((0.85, 0.9, 0.95, 0.55))
+def _window(rng: Random, wall: int, length: float, ceiling: float) -> Opening:
+    width = min(rng.uniform(1.1, 2.0), length - 1.4)
+    left = round((length - width) * rng.uniform(0.35, 0.65), 2)
+    bottom = rng.choice((0.85, 0.9, 0.95, 0.55))
     return Opening(wall, left, round(left + width, 2), bottom, round(min(ceiling - 0.35, 2.25), 2), "window")
 
 
-def plan_shell(dice: Dice) -> Shell:
+def plan_shell(rng: Random) -> Shell:
     """A rectangular or L-shaped room with one door and one to three windows on other walls."""
-    corners, notch = _outline(dice)
-    ceiling = dice.number(2.5, 3.2)
+    corners, notch = _outline(rng)
+    ceiling = rng.uniform(2.5, 3.2)
     shell = Shell(corners, notch, ceiling, ())
     walls = shell.walls
-    order = dice.shuffled([index for index, wall in enumerate(walls) if wall.length >= 2.4])
+    order = rng.shuffled([index for index, wall in enumerate(walls) if wall.length >= 2.4])
     door_wall = walls[order[0]]
-    left = 0.3 if dice.chance(0.5) else round(door_wall.length - 1.2, 2)
+    left = 0.3 if rng.chance(0.5) else round(door_wall.length - 1.2, 2)
     openings = [Opening(order[0], left, round(left + 0.9, 2), 0.0, 2.05, "door")]
-    windows = dice.whole(1, 2) if shell.floor_area < 24 else dice.whole(2, 3)
+    windows = rng.integer(1, 2) if shell.floor_area < 24 else rng.integer(2, 3)
     for index in order[1 : 1 + windows]:
-        openings.append(_window(dice, index, walls[index].length, ceiling))
+        openings.append(_window(rng, index, walls[index].length, ceiling))
     return Shell(corners, notch, ceiling, tuple(openings))
 
 
@@ -277,12 +277,12 @@ def _wall(kit: Kit, shell: Shell, index: int, material: Material) -> list[Surfac
     return moved(made, wall.axes(), np.array([wall.start[0], 0.0, wall.start[1]]))
 
 
-def build_shell(kit: Kit, dice: Dice, shell: Shell) -> list[Surface]:
+def build_shell(kit: Kit, rng: Random, shell: Shell) -> list[Surface]:
     """All surfaces of the empty room in the world frame; their fronts look inwards."""
     made = _floor_and_ceiling(kit, shell)
-    order = dice.shuffled(list(range(len(shell.walls))))
+    order = rng.shuffled(list(range(len(shell.walls))))
     special = dict(zip(order, (kit.feature_wall, kit.papered_wall), strict=False))
-    if dice.chance(0.4):
+    if rng.chance(0.4):
         special[order[2]] = kit.feature_wall
     for index in range(len(shell.walls)):
         made += _wall(kit, shell, index, special.get(index, kit.wall))
