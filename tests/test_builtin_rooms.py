@@ -28,7 +28,7 @@ PLAIN = Material(lambda: np.full((64, 64, 3), 200, np.uint8), 1.0, 1.0)
 
 @cache
 def plan(seed):
-    return plan_room(seed)
+    return plan_room(seed)[1:]
 
 
 @cache
