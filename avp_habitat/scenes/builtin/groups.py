@@ -15,14 +15,11 @@ GAP_M = 0.03
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """A piece in a group; the group's frame has its back at z = 0 and its front towards +z."""
+    """A piece in a group, whose frame has its back at z = 0 and its front towards +z; x is to the right, metres."""
 
     piece: Piece
-    """What."""
     x: float
-    """Metres to the right of the middle, for somebody who looks along -z at the group's back."""
     z: float
-    """Metres in front of the back."""
     quarter: int = 0
     """Quarter turns about +Y, counter-clockwise from above."""
     twist: float = 0.0
@@ -34,7 +31,6 @@ class Group:
     """Pieces with fixed places relative to one another."""
 
     members: tuple[Member, ...]
-    """The pieces."""
     clear: tuple[Rectangle, ...] = ()
     """x0, z0, x1, z1 in front of furniture that people need to use it."""
 
