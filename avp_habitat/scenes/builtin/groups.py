@@ -1,13 +1,13 @@
 """Furniture that belongs together, arranged relative to one another."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
-from avp_habitat.scenes.builtin import decor, seating, storage
+from avp_habitat.scenes.builtin import decor, seating
 from avp_habitat.scenes.builtin.kit import Kit, Piece, shifted
 from avp_habitat.scenes.builtin.noise import Random
-from avp_habitat.scenes.builtin.shapes import Material, Rectangle, Surface, box, yawed
+from avp_habitat.scenes.builtin.shapes import HALF_TURN, Material, Rectangle, box, yawed
 
 GAP_M = 0.03
 """Between furniture and the wall behind it: the skirting board is 15 mm thick."""
@@ -49,12 +49,11 @@ def against_wall(piece: Piece, clear: float) -> Arrange:
 
 def living(kit: Kit, rng: Random) -> list[Arrange]:
     """A television and a sofa that faces it over a coffee table on a rug; the fullest arrangement comes first."""
-    unit, couch = storage.television(kit, rng), seating.sofa(kit, rng)
+    unit, couch = decor.television(kit, rng), seating.sofa(kit, rng)
     table, carpet = seating.coffee_table(kit, rng), decor.rug(kit, 2.3, 1.6)
     seat, beside, lamp = seating.armchair(kit, rng), seating.side_table(kit, rng), decor.floor_lamp(kit, rng)
     side, twist = rng.choice((-1, 1)), rng.uniform(-0.2, 0.2)
     free = rng.uniform(3.3, 3.8)
-
     seat_x = side * max(couch.width / 2 + 0.15, table.width / 2 + 0.16 + seat.depth * 0.6)
 
     def members(back: float) -> list[Member]:
@@ -90,7 +89,7 @@ def dining(kit: Kit, rng: Random) -> Arrange:
         half_x = half_z = radius + 0.32
         for quarter, (x, z) in enumerate(((0, -1), (-1, 0), (0, 1), (1, 0))):
             one = seating.chair(kit, rng, wood)
-            members.append(Member(one, x * half_x, z * half_z, (0, 1, 2, 3)[quarter], rng.uniform(-0.12, 0.12)))
+            members.append(Member(one, x * half_x, z * half_z, quarter, rng.uniform(-0.12, 0.12)))
     else:
         pairs = rng.choice((2, 2, 3))
         table = seating.dining_table(kit, rng, 0.62 * pairs + 0.2, 0.85)
@@ -101,7 +100,7 @@ def dining(kit: Kit, rng: Random) -> Arrange:
                 one = seating.chair(kit, rng, wood)
                 members.append(Member(one, x, z, quarter, rng.uniform(-0.1, 0.1)))
     reach = half_z + 0.4
-    members = [Member(m.piece, m.x, m.z + reach, m.quarter, m.twist) for m in members]
+    members = [replace(member, z=member.z + reach) for member in members]
     members.append(Member(table, 0.0, reach))
     if rng.chance(0.5):
         members.append(Member(decor.rug(kit, 2 * half_x + 0.7, 2 * half_z + 0.5), 0.0, reach))
@@ -129,10 +128,8 @@ def working(kit: Kit, rng: Random) -> Arrange:
     """A desk against the wall and a swivel chair before it."""
     table, stool = seating.desk(kit, rng), seating.office_chair(kit, rng)
     z = GAP_M + table.depth / 2
-    group = Group(
-        (Member(table, 0.0, z), Member(stool, -0.1, GAP_M + table.depth + 0.42, 2, rng.uniform(-0.4, 0.4))),
-        ((-0.5, 0.7, 0.5, 1.6),),
-    )
+    chair = Member(stool, -0.1, GAP_M + table.depth + 0.42, 2, rng.uniform(-0.4, 0.4))
+    group = Group((Member(table, 0.0, z), chair), ((-0.5, 0.7, 0.5, 1.6),))
     return lambda depth: group if depth > 1.7 else None
 
 
@@ -157,7 +154,7 @@ def divider(kit: Kit, rng: Random, ceiling: float) -> list[Arrange]:
 
     @cache
     def piece(length: float) -> Piece:
-        return partition(kit, rng, wall, length, ceiling) if masonry else storage.divider_shelf(kit, rng, length)
+        return partition(kit, rng, wall, length, ceiling) if masonry else decor.divider_shelf(kit, rng, length)
 
     def arrange(depth: float, length: float) -> Group | None:
         if depth - length < 1.1 or length > 0.62 * depth:
@@ -170,14 +167,12 @@ def divider(kit: Kit, rng: Random, ceiling: float) -> list[Arrange]:
 def partition(kit: Kit, rng: Random, material: Material, length: float, ceiling: float) -> Piece:
     """A stub of wall along x with a skirting board and a picture on each side."""
     thick = 0.12
-    made: list[Surface] = box(
-        (length, ceiling, thick), (0, ceiling / 2, 0), material, faces=("front", "back"), pitch=0.25
-    )
-    made += box((length, ceiling, thick), (0, ceiling / 2, 0), kit.trim, faces=("left", "right"), pitch=0.25)
-    made += box(
-        (length - 0.008, 0.09, thick + 0.03), (0, 0.045, 0), kit.trim, faces=("front", "back", "left", "right", "top")
-    )
+    size, middle = (length, ceiling, thick), (0, ceiling / 2, 0)
+    made = box(size, middle, material, faces=("front", "back"), pitch=0.25)
+    made += box(size, middle, kit.trim, faces=("left", "right"), pitch=0.25)
+    sides = ("front", "back", "left", "right", "top")
+    made += box((length - 0.008, 0.09, thick + 0.03), (0, 0.045, 0), kit.trim, faces=sides)
     wide = min(length - 0.5, rng.uniform(0.6, 0.9))
     front = shifted(decor.picture(kit, rng, wide, 0.62), 0, 1.55, thick / 2)
-    back = yawed(shifted(decor.picture(kit, rng, wide * 0.8, 0.7), 0, 1.55, thick / 2), 3.14159265)
+    back = yawed(shifted(decor.picture(kit, rng, wide * 0.8, 0.7), 0, 1.55, thick / 2), HALF_TURN)
     return Piece("partition", made + front + back, length, thick + 0.07, ceiling)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from avp_habitat.errors import UsageError
-from avp_habitat.scenes.builtin import decor, groups, seating, storage
+from avp_habitat.scenes.builtin import decor, groups, seating
 from avp_habitat.scenes.builtin.floorplan import Floor, Placed, places, stand_at
 from avp_habitat.scenes.builtin.groups import Arrange, Member
 from avp_habitat.scenes.builtin.kit import Kit, Piece, shifted
@@ -106,7 +106,7 @@ def _across(floor: Floor, rng: Random) -> Iterator[_Spot]:
 
 def _storage(kit: Kit, rng: Random) -> list[Arrange]:
     """Tall and low furniture for walls, the second shelf and chest last."""
-    kinds = ((storage.bookshelf, 0.55), (storage.wardrobe, 0.6), (storage.drawers, 0.5))
+    kinds = ((decor.bookshelf, 0.55), (decor.wardrobe, 0.6), (decor.drawers, 0.5))
     first = [groups.against_wall(make(kit, rng), clear) for make, clear in kinds]
     second = [groups.against_wall(make(kit, rng), clear) for make, clear in kinds[::2]]
     return rng.shuffled(first) + second

@@ -1,8 +1,8 @@
-"""Tables and what stands on them."""
+"""Seats, beds and tables with what stands on them."""
 
+from avp_habitat.scenes.builtin.decor import book_stack, bowl, table_lamp, vase
 from avp_habitat.scenes.builtin.kit import Kit, Lamp, Piece, shifted
 from avp_habitat.scenes.builtin.noise import Random
-from avp_habitat.scenes.builtin.pictures import SPINES, spine_cell
 from avp_habitat.scenes.builtin.shapes import Material, Surface, box, cushion, cylinder, lathe, leaned, yawed
 
 SEAT_M = 0.46
@@ -49,9 +49,8 @@ def _padded(kit: Kit, rng: Random, width: float, seats: int, cloth: Material, ki
 def sofa(kit: Kit, rng: Random) -> Piece:
     """Two or three seats with loose pillows."""
     seats = rng.choice((2, 3, 3))
-    return _padded(
-        kit, rng, rng.uniform(1.65, 1.85) if seats == 2 else rng.uniform(2.0, 2.3), seats, kit.upholstery, "sofa"
-    )
+    width = rng.uniform(1.65, 1.85) if seats == 2 else rng.uniform(2.0, 2.3)
+    return _padded(kit, rng, width, seats, kit.upholstery, "sofa")
 
 
 def armchair(kit: Kit, rng: Random) -> Piece:
@@ -64,10 +63,8 @@ def chair(kit: Kit, rng: Random, material: Material) -> Piece:
     width, depth, high = 0.44, 0.46, 0.9
     made = _legs(width, depth, SEAT_M - 0.04, 0.04, material)
     made += cushion((width, 0.06, depth), (0, SEAT_M - 0.01, 0), 0.02, kit.second_cloth)
-    for side in (-1, 1):
-        made += box(
-            (0.04, high - SEAT_M, 0.04), (side * 0.2, (high + SEAT_M) / 2, -depth / 2 + 0.02), material, pitch=1
-        )
+    for x in (-0.2, 0.2):
+        made += box((0.04, high - SEAT_M, 0.04), (x, (high + SEAT_M) / 2, -depth / 2 + 0.02), material, pitch=1)
     if rng.chance(0.5):
         made += cushion((0.36, 0.3, 0.04), (0, 0.72, -depth / 2 + 0.025), 0.018, kit.second_cloth)
     else:
@@ -110,48 +107,6 @@ def bed(kit: Kit, rng: Random) -> Piece:
         made += cushion((0.62, 0.13, 0.4), (x, 0.57, -depth / 2 + 0.34), 0.06, kit.linen, puff=0.03)
     made += _pillow(kit, rng, 0.0, 0.62, -depth / 2 + 0.62, -0.95)
     return Piece("bed", made, width, depth, high)
-
-
-def vase(kit: Kit, rng: Random, high: float) -> list[Surface]:
-    """A bellied vase, its foot at the origin, metres."""
-    belly = high * rng.uniform(0.26, 0.36)
-    profile = [
-        (belly * 0.45, high), (belly * 0.5, high * 0.92), (belly * 0.36, high * 0.8), (belly * 0.8, high * 0.6),
-        (belly, high * 0.36), (belly * 0.8, high * 0.12), (belly * 0.55, 0.0),
-    ]  # fmt: skip
-    return lathe([(0.002, high * 0.94), *profile], (0, 0, 0), rng.choice(kit.ceramics), segments=12)
-
-
-def bowl(kit: Kit, rng: Random) -> list[Surface]:
-    """A bowl with fruit, its foot at the origin."""
-    profile = [(0.001, 0.03), (0.09, 0.05), (0.14, 0.09), (0.145, 0.09), (0.1, 0.03), (0.06, 0.0)]
-    made = lathe(profile, (0, 0, 0), rng.choice(kit.ceramics), segments=14)
-    for x, z in ((-0.04, 0.02), (0.045, 0.03), (0.0, -0.05)):
-        made += lathe(
-            [(0.001, 0.075), (0.03, 0.065), (0.04, 0.04), (0.03, 0.012), (0.001, 0.004)], (x, 0.045, z),
-            rng.choice(kit.cushions), segments=8,
-        )  # fmt: skip
-    return made
-
-
-def book_stack(kit: Kit, rng: Random) -> list[Surface]:
-    """A few books lying on each other, foot at the origin."""
-    made, y = [], 0.0
-    for _ in range(rng.integer(2, 4)):
-        thick = rng.uniform(0.02, 0.04)
-        one = box((0.23, thick, 0.16), (0, 0, 0), kit.books, fit=spine_cell(rng.integer(0, SPINES - 1)), pitch=1)
-        made += shifted(yawed(one, rng.uniform(-0.3, 0.3)), 0, y + thick / 2, 0)
-        y += thick + 0.001
-    return made
-
-
-def table_lamp(kit: Kit, rng: Random) -> list[Surface]:
-    """A small lamp, its foot at the origin, 0.46 m high."""
-    made = lathe(
-        [(0.012, 0.3), (0.02, 0.24), (0.06, 0.16), (0.075, 0.09), (0.05, 0.02), (0.06, 0.0)], (0, 0, 0),
-        rng.choice(kit.ceramics), segments=10,
-    )  # fmt: skip
-    return made + lathe([(0.09, 0.46), (0.15, 0.26)], (0, 0, 0), kit.lampshade, segments=14, open_ended=True)
 
 
 def coffee_table(kit: Kit, rng: Random) -> Piece:
@@ -210,19 +165,14 @@ def desk(kit: Kit, rng: Random) -> Piece:
     for place in (0.27, 0.43, 0.59):
         made += box((0.36, 0.145, 0.012), (width / 2 - 0.22, place + 0.04, depth / 2 - 0.024), kit.wood, pitch=1)
         made += box((0.12, 0.012, 0.02), (width / 2 - 0.22, place + 0.07, depth / 2 - 0.012), kit.metal, pitch=1)
-    for x, z in (
-        (-width / 2 + 0.05, -0.28),
-        (-width / 2 + 0.05, 0.28),
-        (width / 2 - 0.05, -0.28),
-        (width / 2 - 0.05, 0.28),
-    ):
-        made += box((0.05, high - 0.035, 0.05), (x, (high - 0.035) / 2, z), kit.dark_wood, pitch=1)
+    for x in (-width / 2 + 0.05, width / 2 - 0.05):
+        for z in (-0.28, 0.28):
+            made += box((0.05, high - 0.035, 0.05), (x, (high - 0.035) / 2, z), kit.dark_wood, pitch=1)
     made += box((0.24, 0.012, 0.18), (-0.08, high + 0.007, -0.14), kit.black, pitch=1)
     made += box((0.05, 0.2, 0.03), (-0.08, high + 0.1, -0.17), kit.black, pitch=1)
     made += box((0.62, 0.37, 0.03), (-0.08, high + 0.31, -0.15), kit.black, pitch=1)
-    made += box(
-        (0.59, 0.34, 0.004), (-0.08, high + 0.31, -0.131), kit.screen, faces=("front",), fit=(0, 0, 1, 1), pitch=1
-    )
+    shown = (0.59, 0.34, 0.004)
+    made += box(shown, (-0.08, high + 0.31, -0.131), kit.screen, faces=("front",), fit=(0, 0, 1, 1), pitch=1)
     made += box((0.42, 0.02, 0.14), (-0.08, high + 0.011, 0.14), kit.keys, fit=(0, 0, 1, 1), pitch=1)
     made += shifted(table_lamp(kit, rng), width / 2 - 0.2, high + 0.001, -0.12)
     made += shifted(book_stack(kit, rng), -width / 2 + 0.17, high + 0.001, 0.05)
@@ -236,11 +186,10 @@ def side_table(kit: Kit, rng: Random) -> Piece:
         made = cylinder(side / 2, high - 0.03, high, (0, 0, 0), kit.wood, 20)
         made += shifted(_legs(0.3, 0.3, high - 0.03, 0.03, kit.dark_wood), 0, 0, 0)
     else:
-        made = box((side, high - 0.12, side), (0, 0.12 + (high - 0.12) / 2, 0), kit.wood)
+        middle = 0.12 + (high - 0.12) / 2
+        made = box((side, high - 0.12, side), (0, middle, 0), kit.wood)
         made += _legs(side - 0.04, side - 0.04, 0.12, 0.04, kit.dark_wood)
-        made += box(
-            (side - 0.06, high - 0.2, 0.012), (0, 0.12 + (high - 0.12) / 2, side / 2 + 0.006), kit.dark_wood, pitch=1
-        )
+        made += box((side - 0.06, high - 0.2, 0.012), (0, middle, side / 2 + 0.006), kit.dark_wood, pitch=1)
         made += box((0.03, 0.03, 0.02), (0, high - 0.14, side / 2 + 0.02), kit.metal, pitch=1)
     if rng.chance(0.65):
         made += shifted(table_lamp(kit, rng), -0.04, high + 0.001, -0.05)

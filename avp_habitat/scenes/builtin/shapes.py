@@ -13,6 +13,8 @@ from avp_habitat.scenes.builtin.noise import Picture
 Float = NDArray[np.floating]
 Vector = tuple[float, float, float]
 Rectangle = tuple[float, float, float, float]
+HALF_TURN = 3.14159265
+"""Radians; the rooms of old keep this many digits of it."""
 
 
 @dataclass(frozen=True, eq=False)
