@@ -23,7 +23,7 @@ from nerfstudio.data.datasets.depth_dataset import DepthDataset
 from avp_nerfstudio.data import verification
 from avp_nerfstudio.data.dataparser import AVPDataParserConfig, UnusableRolloutError
 from avp_nerfstudio.data.frames import spread_order
-from avp_nerfstudio.data.seen_points import MOST_VIEWS
+from avp_nerfstudio.data.frames import MOST_VIEWS
 
 Z_UP = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0]])
 

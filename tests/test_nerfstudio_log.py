@@ -24,8 +24,8 @@ import avp_nerfstudio.log
 from avp_habitat import command
 from avp_habitat.rollout.images import read_rgb
 from avp_nerfstudio.data.dataparser import AVPDataParserConfig
-from avp_nerfstudio.data.heldout import HeldoutView, error_colours, render_views, triptych
-from avp_nerfstudio.tracking.trained_run import open_trained, read_config
+from avp_nerfstudio.method.scores import HeldoutView, error_colours, render_views, triptych
+from avp_nerfstudio.method.checkpoints import open_trained, read_config
 
 SIZE = (64, 48)
 

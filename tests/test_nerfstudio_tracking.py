@@ -22,7 +22,7 @@ from avp_habitat import command
 from avp_habitat.tracking import deliver
 from avp_habitat.tracking.journal import spool_folder
 from avp_nerfstudio.method.trainer import AVPTrainer, TrainingError
-from avp_nerfstudio.tracking.facts import Facts
+from avp_nerfstudio.tracking.mlflow import Facts
 from avp_nerfstudio.tracking.mlflow import open_again, open_run, remembered_id
 
 TINY = ["--pipeline.datamanager.train-num-rays-per-batch", 64, "--pipeline.model.log2-hashmap-size", 8]

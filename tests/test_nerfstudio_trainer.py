@@ -17,7 +17,7 @@ from rrd import entities, rows, verify
 from avp_habitat.errors import AVPError
 from avp_nerfstudio.method.progress import TrainingProgress
 from avp_nerfstudio.method.trainer import AVPTrainer, AVPTrainerConfig, Interruption, TrainingError
-from avp_nerfstudio.tracking.facts import facts_of, rollout_folders
+from avp_nerfstudio.tracking.mlflow import facts_of, rollout_folders
 from avp_nerfstudio.tracking.mlflow import open_run, remembered_id
 
 

@@ -18,7 +18,7 @@ from avp_habitat.rollout.images import read_rgb
 from avp_habitat.rollout.seen import visibility_of
 from avp_nerfstudio import reconstruct
 from avp_nerfstudio.reconstruct import Request
-from avp_nerfstudio.tracking.trained_run import TrainedRunError, config_path
+from avp_nerfstudio.method.checkpoints import TrainedRunError, config_path
 
 ITERATIONS = ("--iterations", "3")
 
@@ -129,7 +129,7 @@ def test_a_fork_of_a_preloaded_process_scores_the_same(room, tmp_path, monkeypat
     )
     assert done.returncode == 0, done.stderr
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["avp_nerfstudio.method.preload"])
+    context.set_forkserver_preload(["avp_nerfstudio.method.reconstruction"])
     receive, send = context.Pipe(duplex=False)
     process = context.Process(target=forked, args=([*words, "--out", str(tmp_path / "fork")], send))
     process.start()
