@@ -43,7 +43,7 @@ class CameraPath:
     """Of the pictures in pixels."""
     height: Annotated[int, Range(8, 8192)] = 480
     """Of the pictures in pixels; their vertical field of view is that of the rollout's pictures."""
-    scale: Annotated[float, Range(1e-6, 1e6)] = 1.0
+    scale: Annotated[float, Range(1e-6, 10**6)] = 1.0
     """avp-data's --scale, where it was used."""
 
     def __post_init__(self) -> None:

@@ -65,7 +65,7 @@ class AVPDataParserConfig(DataParserConfig):
     also: tuple[Path, ...] = ()
     """More rollouts of the same scene and camera, whose frames are trained with too. The held-out views are those of
     --data: they follow from the scene, so all hold the same."""
-    scale: Annotated[float, Range(1e-6, 1e6)] = 1.0
+    scale: Annotated[float, Range(1e-6, 10**6)] = 1.0
     """Multiplies all positions, depths and the scene box; 1 keeps metres. It is written to
     dataparser_transforms.json, so that nerfstudio's exports and poses can be brought back to metres."""
     every: Annotated[int, Range(1, 10**6)] = 1
@@ -82,7 +82,7 @@ class AVPDataParserConfig(DataParserConfig):
     initial_points: Annotated[int, Range(0, 10**8)] = 50_000
     """Give splatfacto at most so many coloured points to begin with, from the depth of at most 24 of the frames; 0
     for none. Other methods ignore them."""
-    box_margin_m: Annotated[float, Range(0, 1e6)] = 0.1
+    box_margin_m: Annotated[float, Range(0, 10**6)] = 0.1
     """The scene box is the box around the frames' cameras and what their depth shows (without the farthest 0.2 % on
     each side; a rollout says how large the navigable area is, not where it lies), and so many metres more on every
     side."""
