@@ -146,7 +146,7 @@ def test_a_fork_of_a_preloaded_process_scores_the_same(room, tmp_path, monkeypat
         (["--frames", "0"], 2, "--frames: expected 1 to 5"),
         (["--frames", "6"], 2, "--frames: expected 1 to 5"),
         (["--iterations", "0"], 2, "--iterations: expected a number from 1, got 0"),
-        (["--seed", "-1"], 2, "--seed: expected a whole number from 0 to 4,294,967,295"),
+        (["--seed", "-1"], 2, "--seed: expected a whole number from 0"),
         (["--pictures", "0", "3"], 2, "--pictures: expected 0 to 2"),
     ],
 )
