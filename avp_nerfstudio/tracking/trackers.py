@@ -140,8 +140,9 @@ class ReconstructionRecording:
         self._recording.disconnect()
 
     def _cameras(self, path: str, dataset: Any, colour: tuple[int, int, int]) -> None:
-        for index in range(0 if dataset is None else len(dataset.cameras)):
-            self._camera(f"{path}/{index:05d}", dataset.cameras[index], _FRUSTUM_M, colour, static=True)
+        cameras = () if dataset is None else dataset.cameras
+        for index in range(len(cameras)):
+            self._camera(f"{path}/{index:05d}", cameras[index], _FRUSTUM_M, colour, static=True)
 
     def _picture(self, path: str, colours: NDArray[np.uint8]) -> None:
         self._recording.log(path, _rerun().Image(colours).compress(jpeg_quality=_JPEG_QUALITY))
