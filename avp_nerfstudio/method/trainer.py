@@ -84,7 +84,9 @@ class AVPTrainer(Trainer):
                 self._trackers = Trackers(self.config, address, self.pipeline)
         except AVPError as error:
             discard_outputs(self.config)
-            raise error if isinstance(error, CommandError) else CommandError(str(error)) from error
+            if isinstance(error, CommandError):
+                raise
+            raise CommandError(str(error)) from error
 
     def train(self) -> None:
         """Train; Ctrl-C saves a checkpoint after the iteration it came in, and a second one ends at once."""
