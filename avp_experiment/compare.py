@@ -17,9 +17,9 @@ from avp_experiment.presets import PRESETS, preset_named
 from avp_experiment.runner import PRELOAD, Runner, default_jobs
 from avp_experiment.store import Store, bytes_needed
 from avp_habitat import command
-from avp_habitat.errors import AVPError, UsageError, unknown_name
+from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.rollout.capture import VIEWS
-from avp_habitat.simulators.registry import ONE_PER_PROCESS, SIMULATOR_NAMES, SimulatorChoice, add_up_option
+from avp_habitat.simulators.registry import SIMULATORS, SimulatorChoice, add_up_option
 
 if TYPE_CHECKING:
     from avp_experiment.tracking import Parent
@@ -49,7 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--seeds", default=AUTO, help="trainings of each reward; auto: the preset's (default: %(default)s)")
     add("--starts", default=AUTO, help="episodes of each method, scene and seed; auto: the preset's")
     add("--methods", default=AUTO, help=f"with commas between, of {', '.join(METHODS)}; auto: {', '.join(DEFAULT)}")
-    add("--simulator", default="raycast", help=f"{', '.join(SIMULATOR_NAMES)} (default: %(default)s)")
+    add("--simulator", default="raycast", help=f"{', '.join(SIMULATORS)} or MODULE:FACTORY (default: %(default)s)")
     add_up_option(parser)
     add(
         "--out",
@@ -74,8 +74,7 @@ def read_options(argv: Sequence[str]) -> Options:
     if given.starts != AUTO:
         preset = replace(preset, starts=_number("starts", given.starts))
     jobs = default_jobs() if given.jobs == AUTO else _number("jobs", given.jobs)
-    if given.simulator not in SIMULATOR_NAMES:
-        raise unknown_name("simulator", given.simulator, SIMULATOR_NAMES)
+    SimulatorChoice(given.simulator)
     unseen = [] if given.unseen == NONE else _split(given.unseen)
     scenes = read_scenes(_split(given.scene), unseen, SimulatorChoice(given.simulator, up=given.up))
     out = Path("runs") / f"experiment-{given.preset}" if given.out == AUTO else Path(given.out)
@@ -132,7 +131,7 @@ def run(options: Options, line: str) -> None:
         status = "FAILED"
         try:
             cells = plan(options.configuration, options.out, tracking=parent.experiment)
-            preload = () if options.configuration.simulator in ONE_PER_PROCESS else PRELOAD
+            preload = () if SimulatorChoice(options.configuration.simulator).one_per_process else PRELOAD
             runner = Runner(store, options.jobs, environment(tracking_uri()), preload)
             runner.run(cells)
             write_report(options, store, cells, line, parent)

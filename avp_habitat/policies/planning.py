@@ -9,6 +9,13 @@ from numpy.typing import NDArray
 from avp_habitat.task.agent_view import AgentView, agent_views
 
 
+def action_shape(observation: Any, agents: int) -> tuple[int, ...]:
+    """Of the actions for observations of any kind: `(n,)`, or `()` for one agent alone."""
+    if agents > 1:
+        return (agents,)
+    return (1,) if np.ndim(observation) == 2 and len(observation) == 1 else ()
+
+
 class Planner(Protocol):
     """Plans for one agent within one episode."""
 
@@ -48,7 +55,7 @@ class PlanningPolicy:
             self._generators = [np.random.default_rng(seed) for seed in seeds]
             self._planners, self._steps = [None] * len(views), [0] * len(views)
         actions = np.array([self._act(index, view) for index, view in enumerate(views)], dtype=np.int64)
-        return actions.reshape(np.shape(observation)[:-1]), None
+        return actions.reshape(action_shape(observation, len(views))), None
 
     def make_planner(self, rng: np.random.Generator) -> Planner:
         """A planner for one episode of one agent, which may draw from `rng`."""

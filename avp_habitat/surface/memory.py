@@ -13,8 +13,8 @@ from avp_habitat.sight.tables import SPACING_M, once_per_simulator, point_table,
 from avp_habitat.simulators.base import Simulator, SingleRays
 from avp_habitat.surface.map import SurfaceMapper
 from avp_habitat.surface.points import scene_surface
-from avp_habitat.task.perception import Views
 from avp_habitat.task.settings import TaskSettings
+from avp_habitat.task.views import Views
 
 Float = NDArray[np.floating]
 Rows = NDArray[np.integer]

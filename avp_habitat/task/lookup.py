@@ -9,14 +9,14 @@ from avp_habitat.sight.newly_seen import new_cells
 from avp_habitat.sight.rules import camera_numbers
 from avp_habitat.sight.tables import pitches, scene_tables, single_rays
 from avp_habitat.simulators.base import Simulator
-from avp_habitat.task.perception import Float, Perception, Views, centre_depth
 from avp_habitat.task.settings import TaskSettings
+from avp_habitat.task.views import Shown, Views
 
 _YAW_STEP = 2 * np.pi / panorama.YAWS
 _PITCH_STEP = np.radians(panorama.PITCH_STEP_DEG)
 
 
-class TableSenses:
+class TableSensor:
     """Depth statistics interpolated between the tables' places; cells on which the places differ are cast as rays."""
 
     def __init__(self, simulator: Simulator, settings: TaskSettings) -> None:
@@ -37,15 +37,15 @@ class TableSenses:
         self._centres = np.ascontiguousarray(simulator.area.centres)
         self._camera = camera_numbers(settings.intrinsics)
 
-    def look(self, views: Views) -> Perception:
-        """See `Senses`."""
+    def look(self, views: Views) -> Shown:
+        """See `Sensor`."""
         slots, weights = self._tables.around(views.position)
-        return self._perceive(views, slots, weights, np.zeros(len(slots), dtype=np.int64))
+        return self._shown(views, slots, weights, np.zeros(len(slots), dtype=np.int64))
 
     def capture(
         self, views: Views, first_seen: NDArray[np.int16], rows: NDArray[np.integer], steps: NDArray[np.integer]
-    ) -> Perception:
-        """See `Senses`."""
+    ) -> Shown:
+        """See `Sensor`."""
         slots, weights = self._tables.around(views.position)
         pose, reach_m = views.camera_to_world, self._settings.max_range_m
         visible = self._tables.columns["visible"]
@@ -57,15 +57,11 @@ class TableSenses:
             agent, cell = pairs[reached].T
             first_seen[rows[agent], cell] = steps[agent]
             found += np.bincount(agent, minlength=len(found))
-        return self._perceive(views, slots, weights, found)
+        return self._shown(views, slots, weights, found)
 
-    def centre_depth(self, views: Views) -> Float:
-        """See `Senses`; one ray for each view."""
-        return centre_depth(self._simulator, self._settings, views)
-
-    def _perceive(
+    def _shown(
         self, views: Views, slots: NDArray[np.int32], weights: NDArray[np.float32], found: NDArray[np.int64]
-    ) -> Perception:
+    ) -> Shown:
         yaw, pitch = (views.yaw % (2 * np.pi)) / _YAW_STEP, (views.pitch - self._lowest) / _PITCH_STEP
         least, mean = panorama.interpolate(self._tables.columns["statistics"], slots, weights, yaw, pitch)
-        return Perception(least, mean, found)
+        return Shown(least, mean, found)
