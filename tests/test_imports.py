@@ -22,7 +22,7 @@ LIGHT = (
     "poses",
     "ranges",
     "rollout.format",
-    "rollout.png",
+    "rollout.images",
     "sight.rules",
     "sight.visibility",
     "task.rewards",

@@ -12,7 +12,7 @@ from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout import images
 from avp_habitat.rollout.capture import capture_step, publish_rollout
 from avp_habitat.rollout.format import read_rollout
-from avp_habitat.rollout.png import check_png_contents
+from avp_habitat.rollout.images import check_png_contents
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.task.env import AVPEnv
 
