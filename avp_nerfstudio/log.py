@@ -16,8 +16,7 @@ from avp_habitat import command
 from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.metrics import TERMS, explained
 from avp_habitat.tracking.experiments import DEFAULT_HELP
-from avp_habitat.tracking.names import open_store
-from avp_habitat.tracking.stores import DEFAULT_ADDRESS, about_run, address_of
+from avp_habitat.tracking.stores import DEFAULT_ADDRESS, about_run, address_of, open_store
 from avp_nerfstudio.tracking.mlflow import open_again
 from avp_nerfstudio.tracking.trained_run import TrainedRun, config_path, open_trained, read_config
 

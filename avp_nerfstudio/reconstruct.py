@@ -18,8 +18,7 @@ from avp_habitat.errors import RolloutError, UsageError, unknown_name
 from avp_habitat.files import NewFolder
 from avp_habitat.metrics import explained
 from avp_habitat.rollout.format import Rollout, read_rollout
-from avp_habitat.tracking.names import open_store
-from avp_habitat.tracking.stores import DEFAULT_ADDRESS, address_of
+from avp_habitat.tracking.stores import DEFAULT_ADDRESS, address_of, open_store
 
 METHODS = ("avp-nerfacto", "nerfacto")
 SEED = 42

@@ -68,7 +68,7 @@ class Sender:
         """
         self._journal = journal
         self._client: Any = client
-        self._run_id = None
+        self._run_id: str | None = None
         self._uncertain = uncertain
         self._interval_s = interval_s
         self._hurry = threading.Event()
@@ -173,7 +173,7 @@ class Sender:
             self._journal.update({"run_id": create_run(self._client, header)})
         elif header.get("continue"):
             self._client.update_run(header["run_id"], status="RUNNING")
-        return header["run_id"]
+        return str(header["run_id"])
 
     def _send(self, entries: Sequence[dict[str, Any]]) -> None:
         """Tell MLflow; any error is one that may pass."""

@@ -190,7 +190,7 @@ class Journal:
         """
         if self.folder is None and self._temporary is None:
             self._temporary = tempfile.TemporaryDirectory(prefix="avp-mlflow-")
-        home = Path(self._temporary.name if self._temporary else self.folder) / "files" / uuid4().hex
+        home = Path(self.folder or self._temporary.name) / "files" / uuid4().hex  # type: ignore[union-attr]
         home.mkdir(parents=True)
         try:
             yield home / name

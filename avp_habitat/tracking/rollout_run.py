@@ -277,7 +277,7 @@ class LogRollouts:
         if not self.rollouts:
             raise UsageError("expected at least one rollout; --help shows all options")
         if self.mlflow == "off":
-            raise UsageError("mlflow: off: expected an address or auto, because logging is all that this command does")
+            raise UsageError("mlflow: expected an address or auto, got off: logging is all that this command does")
 
 
 def main(options: LogRollouts) -> None:

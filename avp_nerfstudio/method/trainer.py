@@ -20,9 +20,8 @@ from nerfstudio.utils import comms
 
 from avp_habitat.command import INTERRUPTED
 from avp_habitat.errors import AVPError
-from avp_habitat.tracking.names import open_store
 from avp_habitat.tracking.run import Status
-from avp_habitat.tracking.stores import address_of
+from avp_habitat.tracking.stores import address_of, open_store
 from avp_nerfstudio.method.progress import TrainingProgress
 from avp_nerfstudio.method.running import discard_outputs
 from avp_nerfstudio.tracking.logger import Trackers

@@ -8,11 +8,9 @@ from typing import Any
 
 from avp_habitat.provenance import flat
 from avp_habitat.rollout.format import read_meta
-from avp_habitat.tracking import rollout_facts
+from avp_habitat.tracking import names, rollout_run
 from avp_habitat.tracking.names import safe_name
 
-METHOD_TAG = "avp.method"
-_MAX_TAG = 5000
 # Of no meaning for the result; `mlflow` is an address, which may hold a password.
 _NOT_SETTINGS = ("viewer.", "mlflow", "rerun", "logging.local_writer.", "load_config")
 
@@ -45,21 +43,21 @@ def facts_of(config: Any) -> Facts:
         RolloutError: `rollout.json` or `steps.csv` cannot be read.
     """
     config.set_experiment_name()
-    tags = {METHOD_TAG: str(config.method_name), rollout_facts.KIND_TAG: rollout_facts.RECONSTRUCTION}
+    tags = {names.METHOD_TAG: str(config.method_name), names.KIND_TAG: names.RECONSTRUCTION}
     name = f"{config.method_name} {config.experiment_name}"
     folders = tuple(rollout_folders(config))
     if not folders:
         return Facts(name, settings(config), tags)
     metas = [read_meta(folder) for folder in folders]
-    ids = [rollout_facts.policy_run_id(folder, meta) for folder, meta in zip(folders, metas, strict=True)]
+    ids = [rollout_run.policy_run_id(folder, meta) for folder, meta in zip(folders, metas, strict=True)]
     policy_runs = tuple(dict.fromkeys(run_id for run_id in ids if run_id is not None))
-    tags |= rollout_facts.origin(metas[0]) | {
-        rollout_facts.ROLLOUT_TAG: joined(folders),
-        rollout_facts.ROLLOUT_ID_TAG: joined(map(rollout_facts.rollout_id, folders)),
+    tags |= rollout_run.origin(metas[0]) | {
+        names.ROLLOUT_TAG: joined(folders),
+        names.ROLLOUT_ID_TAG: joined(map(rollout_run.rollout_id, folders)),
     }
     if policy_runs:
-        tags[rollout_facts.POLICY_RUN_TAG] = joined(policy_runs)
-    title = rollout_facts.title(metas[0])
+        tags[names.POLICY_RUN_TAG] = joined(policy_runs)
+    title = rollout_run.title(metas[0])
     if title is not None and len(folders) == 1 and config.experiment_name in (folders[0].stem, "unnamed"):
         # nerfstudio's own names: that of the folder, or none where the data is given to the dataparser.
         name = f"{config.method_name} {title}"
@@ -67,9 +65,9 @@ def facts_of(config: Any) -> Facts:
     prefix = "eval" if _is_whole(config) else "rollout"
     return Facts(
         name,
-        settings(config) | rollout_facts.rollout_params(metas[0]),
+        settings(config) | rollout_run.rollout_params(metas[0]),
         tags,
-        rollout_facts.figures(metas[0], prefix),
+        rollout_run.figures(metas[0], prefix),
         folders,
         policy_runs,
     )
@@ -99,7 +97,7 @@ def settings(config: Any) -> dict[str, str]:
 
 def joined(values: Iterable[object]) -> str:
     """Several values as one tag."""
-    return ", ".join(map(str, values))[:_MAX_TAG]
+    return ", ".join(map(str, values))[: names.MAX_TAG]
 
 
 def _is_whole(config: Any) -> bool:

@@ -9,9 +9,9 @@ import nerfstudio.engine.trainer  # noqa: F401
 from nerfstudio.utils import writer
 from nerfstudio.utils.writer import EventName, Writer
 
+from avp_habitat.tracking.deliver import recover_in_background
 from avp_habitat.tracking.journal import spool_folder
 from avp_habitat.tracking.names import OFFLINE
-from avp_habitat.tracking.opening import recover_in_background
 from avp_habitat.tracking.run import Status, TrackedRun
 from avp_habitat.tracking.stores import about_run
 from avp_nerfstudio.tracking.facts import facts_of

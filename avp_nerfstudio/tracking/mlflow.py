@@ -6,13 +6,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from avp_habitat.tracking.journal import Journal, spool_folder
-from avp_habitat.tracking.names import find_run, open_store
-from avp_habitat.tracking.opening import NewRun, continue_run, finish, join_run, journal_of, may_continue, start_run
-from avp_habitat.tracking.rollout_facts import POLICY_RUN_TAG, ROLLOUT_RUN_TAG
+from avp_habitat.tracking.deliver import finish
+from avp_habitat.tracking.experiments import find_run
+from avp_habitat.tracking.journal import Journal, journal_of, spool_folder
+from avp_habitat.tracking.names import CONTINUED_TAG, POLICY_RUN_TAG, ROLLOUT_RUN_TAG
 from avp_habitat.tracking.rollout_run import rollout_run
-from avp_habitat.tracking.run import TrackedRun
-from avp_habitat.tracking.stores import TrackingError
+from avp_habitat.tracking.run import NewRun, TrackedRun, continue_run, join_run, may_continue, start_run
+from avp_habitat.tracking.stores import TrackingError, open_store
 from avp_nerfstudio.tracking.facts import Facts, joined
 
 if TYPE_CHECKING:
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 RUN_FILE = "mlflow_run_id.txt"
 """In a training's folder: the id of its run."""
-_CONTINUED_TAG = "avp.continued_from"
 
 
 def open_run(
@@ -36,7 +35,7 @@ def open_run(
         facts: of the training.
         folder: of the training, where the run's id is remembered.
         experiment: MLflow's, made when it does not exist; when neither named nor given by the runs above,
-            as `experiments.meant` says.
+            as `experiments.chosen_experiment` says.
         earlier: id of the run that is continued.
 
     Raises:
@@ -48,7 +47,7 @@ def open_run(
         # Its origin and figures stay as they are; settings that are no longer the same are noted in a tag.
         run.params(facts.params)
     else:
-        run = _new(address, facts, experiment, {} if earlier is None else {_CONTINUED_TAG: earlier})
+        run = _new(address, facts, experiment, {} if earlier is None else {CONTINUED_TAG: earlier})
     _remember(folder, run)
     return run
 
