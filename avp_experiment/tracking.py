@@ -9,16 +9,14 @@ from typing import Any
 
 from avp_habitat.metrics import mean_and_half_width
 from avp_habitat.provenance import flat
-from avp_habitat.tracking.comparison import METHOD_TAG, POLICY_TAG, SCENE_TAG
-from avp_habitat.tracking.experiments import NAME_VARIABLE
-from avp_habitat.tracking.names import PARENT_TAG, existing_run, find_run
-from avp_habitat.tracking.opening import NewRun, join_run, start_run
-from avp_habitat.tracking.run import Status, TrackedRun
+from avp_habitat.tracking.experiments import NAME_VARIABLE, existing_run, find_run
+from avp_habitat.tracking.names import KIND_TAG, METHOD_TAG, PARENT_TAG, POLICY_TAG, SCENE_TAG
+from avp_habitat.tracking.run import NewRun, Status, TrackedRun, join_run, start_run
 from avp_habitat.tracking.stores import DEFAULT_ADDRESS, absolute, connect
 
 EXPERIMENT = "avp-experiment"
 """MLflow experiment outside of `mlflow run` where `MLFLOW_EXPERIMENT_NAME` names none."""
-KIND_TAG, KIND = "avp.kind", "experiment"
+KIND = "experiment"
 _ARTIFACTS = ("*.md", "*.csv", "*.png", "results.json", "experiment.json")
 _SHOWN = ("views", "coverage", "annd_m", "ei", "path_length_m", "visibility", "collisions", "stopped")
 

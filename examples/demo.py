@@ -212,8 +212,8 @@ def write_table(folder: Path, rows: Sequence[Row], settings: Settings) -> str:
 
 def track(demo: Demo, rows: Sequence[Row]) -> None:
     """Scores for the reconstructions' MLflow runs, which lie below those of their rollouts; then the comparison."""
-    from avp_habitat.tracking.names import find_run
-    from avp_habitat.tracking.opening import join_run
+    from avp_habitat.tracking.experiments import find_run
+    from avp_habitat.tracking.run import join_run
     from avp_habitat.tracking.stores import connect
 
     client = connect(_TRACKING_URI)
