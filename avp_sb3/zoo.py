@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import psutil
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
 from avp_habitat.errors import UsageError
@@ -19,6 +20,7 @@ from avp_sb3.vec_env.subproc import AVPSubprocVecEnv
 
 _REPLACED = {"Monitor", "OrderEnforcing", "PassiveEnvChecker"}
 """Wrappers whose work the batch does itself, or does not need."""
+_WITH_LOOKUP = "raycast"
 _HOOK = "avp_sb3.zoo.Batched"
 
 
@@ -55,38 +57,89 @@ def Batched(venv: VecEnv, *, scenes: Sequence[str | Path] = (), lookup: bool = T
         )
     for scene in scenes:
         locate(scene)
-    options: dict[str, Any] = {"agents": venv.num_envs, "settings": _settings(venv, lookup), "seed": venv._seeds[0]}
+    choice = venv.get_attr("choice")[0]
+    name = choice.simulator if choice else venv.get_attr("simulator")[0].name
+    options = {
+        "agents": venv.num_envs,
+        "settings": replace(_settings(venv), lookup=lookup and name == _WITH_LOOKUP),
+        "seed": venv._seeds[0],
+    }
+    files = _monitor_files(venv)
     if isinstance(venv, SubprocVecEnv):
-        return _in_processes(venv, scenes or _shortest_cycle(venv.get_attr("scene")), options)
-    batch = AVPVecEnv(simulator=_simulators(venv, scenes), **options)
-    folder = _remove_monitor_files([writer.file_handler.name for writer in _monitor_writers(venv)])
-    venv.close()
-    return VecMonitor(batch, filename=folder)
+        batch = _in_processes(venv, choice, scenes, options)
+    else:
+        batch = AVPVecEnv(simulator=_simulators(venv, choice, scenes), **options)
+        venv.close()
+    for file in files:
+        file.unlink()
+    return VecMonitor(batch, filename=str(files[0].parent) if files else None)
 
 
 def _reason_to_leave(venv: VecEnv) -> str | None:
     """What the batch would leave out; None when it would leave out nothing."""
     if not isinstance(venv, (DummyVecEnv, SubprocVecEnv)):
         return f"they are a {type(venv).__name__}"
-    # A wrapper's text has those of all that it wraps: "<Monitor<OrderEnforcing<AVPEnv<AVP-v0>>>>".
-    names = [re.findall(r"<(\w+)", text) for text in venv.env_method("__str__")]
+    # An environment's text names its wrappers: <Monitor<OrderEnforcing<PassiveEnvChecker<AVPEnv<AVP-v0>>>>>.
+    names = [re.findall(r"<(\w+)(?=[<> ])", text) for text in venv.env_method("__str__")]
     if not venv.has_attr("scene_digest"):
-        inner = [name for name in names[0] if name not in _REPLACED]
-        raise UsageError(f"{_HOOK}: expected environments of AVP-v0, got {inner[0]}")
+        raise UsageError(f"{_HOOK}: expected environments of AVP-v0, got {names[0][-1]}")
     if venv.render_mode is not None:
         return f"they render (render_mode {venv.render_mode!r})"
-    wrappers = [name for own in names for name in own[:-1] if name not in _REPLACED and own[-1] != name]
-    return wrappers and f"they are wrapped in {wrappers[0]}" or None
+    wrappers = [name for own in names for name in own[:-1] if name not in _REPLACED]
+    return f"they are wrapped in {wrappers[0]}" if wrappers else None
 
 
-def _settings(venv: VecEnv, lookup: bool) -> TaskSettings:
-    settings, *others = venv.get_attr("settings")
+def _settings(venv: VecEnv) -> TaskSettings:
+    """Those of all environments."""
+    first, *others = venv.get_attr("settings")
     for index, other in enumerate(others, start=1):
-        for field in fields(settings):
-            one, another = getattr(settings, field.name), getattr(other, field.name)
+        for field in fields(first):
+            one, another = getattr(first, field.name), getattr(other, field.name)
             if one != another:
                 raise UsageError(
                     f"{_HOOK}: expected the same settings in every environment, found {field.name} {one!r} in "
                     f"number 0 and {another!r} in number {index}"
                 )
-    return settings
+    return first
+
+
+def _simulators(venv: VecEnv, choice: SimulatorChoice | None, scenes: Sequence[str | Path]) -> list[Simulator]:
+    own: list[Simulator] = venv.get_attr("simulator")
+    if not scenes:
+        return _shortest_cycle(own)
+    choice = choice or SimulatorChoice(own[0].name)
+    if choice.simulator in ONE_PER_PROCESS and len(scenes) > 1:
+        raise UsageError(
+            f"{_HOOK}: scenes: a process can hold one simulator of {choice.simulator!r}, got {len(scenes)} scenes; add "
+            f"--vec-env subproc and set n_envs:{len(scenes)}, with n_steps so that their product is PPO's buffer"
+        )
+    return [open_simulator(choice, scene) for scene in scenes]
+
+
+def _in_processes(
+    venv: SubprocVecEnv, choice: SimulatorChoice | None, scenes: Sequence[str | Path], options: dict[str, Any]
+) -> AVPSubprocVecEnv:
+    if choice is None:
+        raise UsageError(f"{_HOOK}: expected environments whose simulator is chosen by name, got an open one")
+    scenes = scenes or _shortest_cycle(venv.get_attr("scene"))
+    workers = venv.num_envs - venv.num_envs % len(scenes)
+    # Their scenes are opened once more: what a process holds stays there.
+    venv.close()
+    return AVPSubprocVecEnv(scenes, workers=workers, **vars(choice), **options)
+
+
+def _shortest_cycle(each: list[Any]) -> list[Any]:
+    """The fewest things of which number i modulo their number is that of agent i."""
+    for length in range(1, len(each)):
+        if all(one == each[i % length] for i, one in enumerate(each)):
+            return each[:length]
+    return each
+
+
+def _monitor_files(venv: VecEnv) -> list[Path]:
+    """The environments' monitor files, of which each holds a header only."""
+    if isinstance(venv, SubprocVecEnv):
+        opened = [file.path for process in venv.processes for file in psutil.Process(process.pid).open_files()]
+        return [Path(path) for path in opened if path.endswith(Monitor.EXT)]
+    found = venv.get_attr("results_writer") if venv.has_attr("results_writer") else []
+    return [Path(writer.file_handler.name) for writer in found if writer is not None]

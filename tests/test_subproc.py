@@ -110,10 +110,6 @@ def test_what_cannot_leave_its_process_says_so_and_the_workers_go_on(five):
         five.get_attr("simulator")
     with pytest.raises(UsageError, match=r"AVPSubprocVecEnv: budget cannot be set"):
         five.set_attr("budget", 3)
-    with pytest.raises(
-        UsageError, match=r"get_attr: the answer cannot leave the process.*\[worker 1 of 4 \(scene builtin:1\)\]"
-    ):
-        five.get_attr("_task", 1)
     with pytest.raises(AttributeError, match="nothing"):
         five.get_attr("nothing")
     assert not five.has_attr("nothing")
@@ -143,7 +139,7 @@ def test_a_worker_that_leaves_by_itself_is_told_with_its_exit_code(make):
     env = make()
     env.reset()
     os.kill(env.processes[0].pid, signal.SIGTERM)
-    with pytest.raises(SimulatorError, match=r"worker 0 of 2 \(scene builtin:0\) ended with exit code 143"):
+    with pytest.raises(SimulatorError, match=r"worker 0 of 2 \(scene builtin:0\) was killed by SIGTERM"):
         env.reset()
 
 

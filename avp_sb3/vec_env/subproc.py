@@ -181,9 +181,7 @@ class AVPSubprocVecEnv(SubprocVecEnv):
         """An attribute of the chosen agents, as separate `AVPEnv`s have it; `simulator` stays in its process."""
         rows = self._get_indices(indices)
         if attr_name == "simulator":
-            raise UsageError(
-                "AVPSubprocVecEnv: simulator stays in its process; ask for area, scene_name or agent_view"
-            )
+            raise UsageError("AVPSubprocVecEnv: simulator stays in its process; ask for area, scene_name or agent_view")
         if attr_name in ("settings", "render_mode"):
             return [getattr(self, attr_name) for _ in rows]
         if attr_name in _FIXED:
