@@ -62,8 +62,9 @@ class Evaluate:
     """Log nothing to MLflow."""
 
     def __post_init__(self) -> None:
-        """Hold the ranges."""
+        """Refuse what cannot be right."""
         hold_ranges(self)
+        _ = self.settings
         if not self.policy:
             raise UsageError("policy: expected at least one")
         object.__setattr__(self, "policy", tuple(dict.fromkeys(self.policy)))
@@ -79,7 +80,6 @@ def main(options: Evaluate) -> None:
     out = options.out or Path("runs") / f"evaluation-{datetime.now():%Y%m%d-%H%M%S}"
     check_new(out, option="--out")
     check_writable(out, failure=ReportError)
-    settings = options.settings
     for policy in options.policy:
         check_policy(policy)
     print(f"opening {options.scene} for {', '.join(map(described, options.policy))} …", flush=True)
@@ -89,7 +89,7 @@ def main(options: Evaluate) -> None:
         PolicyRunner(
             policy,
             simulator,
-            settings,
+            options.settings,
             observation=options.observation,
             stochastic=options.stochastic,
             trusted=options.trusted,

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from tyro.conf import arg
 
 from avp_habitat import command
-from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.errors import UsageError
 from avp_habitat.files import check_writable
 from avp_habitat.policies.registry import TRUSTED, load_model
 from avp_habitat.policies.saved_model import is_normalised, load_statistics, statistics_of
@@ -20,7 +20,7 @@ from avp_habitat.simulators.registry import ONE_PER_PROCESS, SimulatorChoice
 from avp_habitat.task.rewards import REWARD_NAMES
 from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
-from avp_sb3.presets import PRESETS, Preset
+from avp_sb3.presets import MAP, PRESETS, Preset
 
 _MLFLOW = "runs:/"
 _MOST = 1e12
@@ -68,20 +68,19 @@ class Train:
     """Of the MLflow run (omitted: algorithm, reward, scene and seed)."""
 
     def __post_init__(self) -> None:
-        """Hold the ranges."""
-        if self.observation not in PRESETS:
-            raise unknown_name("observation", self.observation, PRESETS)
+        """Refuse what cannot be right."""
         hold_ranges(self)
-        buffer = PRESETS[self.observation].n_envs * PRESETS[self.observation].n_steps
-        if self.agents is not None and (self.agents < 1 or buffer % self.agents):
-            raise UsageError(f"agents: expected a divisor of PPO's buffer of {buffer} steps, got {self.agents}")
+        _ = self.settings, self.preset
 
     @property
     def preset(self) -> Preset:
         """PPO's settings; the buffer is shared by as many agents as asked for."""
-        preset = PRESETS[self.observation]
-        agents = self.agents or preset.n_envs
-        return replace(preset, n_envs=agents, n_steps=preset.n_envs * preset.n_steps // agents)
+        preset = PRESETS.get(self.observation, MAP)
+        buffer = preset.n_envs * preset.n_steps
+        agents = preset.n_envs if self.agents is None else self.agents
+        if agents < 1 or buffer % agents:
+            raise UsageError(f"agents: expected a divisor of PPO's buffer of {buffer} steps, got {agents}")
+        return replace(preset, n_envs=agents, n_steps=buffer // agents)
 
     @property
     def settings(self) -> TaskSettings:
@@ -95,14 +94,14 @@ class Train:
         )
 
 
-def _environment(options: Train, settings: TaskSettings) -> Any:
+def _environment(options: Train) -> Any:
     """The agents in this process, or in several: when asked for, and where each scene needs its own simulator."""
     from stable_baselines3.common.vec_env import VecMonitor
 
     from avp_sb3 import AVPSubprocVecEnv, AVPVecEnv
 
     choice, scenes = options.simulator, list(options.scene)
-    common = {"agents": options.preset.n_envs, "settings": settings, "seed": options.seed, **vars(choice)}
+    common = {"agents": options.preset.n_envs, "settings": options.settings, "seed": options.seed, **vars(choice)}
     if options.workers is None and (len(scenes) == 1 or choice.simulator not in ONE_PER_PROCESS):
         return VecMonitor(AVPVecEnv(scenes, **common))
     return VecMonitor(AVPSubprocVecEnv(scenes, workers=options.workers, **common))
@@ -177,7 +176,6 @@ def _callbacks(options: Train, tracking: Any) -> list[Any]:
 
 def main(options: Train) -> None:
     """Train, track and save."""
-    settings = options.settings
     check_writable(options.out)
     print(f"opening {', '.join(options.scene)} …", flush=True)
 
@@ -189,7 +187,7 @@ def main(options: Train) -> None:
 
     # The policy is a small network: more threads of torch only wait for each other.
     torch.set_num_threads(1)
-    env = _environment(options, settings)
+    env = _environment(options)
     model = _model(options, env)
     tracking = MLflowCallback(options.experiment, run_name=options.run_name)
     callbacks = _callbacks(options, tracking)
