@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.logger import Logger
 
 from avp_habitat.errors import AVPError
 
@@ -22,6 +23,15 @@ class LoggedFile:
     """Where it lies."""
     name: str
     """How the artifact is called, `/` for folders: an artifact of the same name is replaced."""
+
+
+_LONGEST = 33
+"""Letters of a name behind its first `/` on the screen: SB3 cuts longer ones, and refuses two that it cut to the same."""
+
+
+def record(logger: Logger, name: str, value: float) -> None:
+    """Record a figure, which is not shown on the screen where its name is too long for that."""
+    logger.record(name, value, ("stdout", "log") if len(name.partition("/")[2]) > _LONGEST else None)
 
 
 class MissingInfoError(AVPError):

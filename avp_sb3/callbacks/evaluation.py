@@ -13,7 +13,7 @@ from avp_habitat.errors import UsageError, unknown_name
 from avp_habitat.metrics import FIGURES
 from avp_habitat.simulators.registry import ONE_PER_PROCESS, SimulatorChoice
 from avp_habitat.task.settings import TaskSettings
-from avp_sb3.callbacks.base import NOT_FOR, LoggedFile, MissingInfoError, is_learning
+from avp_sb3.callbacks.base import NOT_FOR, LoggedFile, MissingInfoError, is_learning, record
 from avp_sb3.callbacks.best_model import WHEN, BestModel, statistics_of
 from avp_sb3.evaluation.batch import READER, check_fit, means, own_random_state, run_batch, scenes_of
 from avp_sb3.evaluation.picture import evaluation_picture
@@ -24,10 +24,7 @@ from avp_sb3.vec_env.subproc import AVPSubprocVecEnv
 DEFAULT_SCENES = ("builtin:7",)
 DEFAULT_EVERY, DEFAULT_EPISODES = 150_000, 10
 """About 0.7 % of a training with Table 4's values and tables; whoever evaluates more often pays in proportion."""
-_SCREEN = ("stdout", "log")
-_NO_PICTURES = (*_SCREEN, "json", "csv")
-_LONGEST_SCENE = 18
-"""Letters of a scene's name on the screen: SB3 cuts names at 36 and refuses two that it cut to the same."""
+_NO_PICTURES = ("stdout", "log", "json", "csv")
 
 
 class EvaluationCallback(BaseCallback):
@@ -191,12 +188,10 @@ class EvaluationCallback(BaseCallback):
     def _record(self, logger: Logger, found: dict[str, list[Episode]]) -> None:
         figures = means([episode for episodes in found.values() for episode in episodes])
         for name, value in figures.items():
-            logger.record(f"eval/{name}", value)
+            record(logger, f"eval/{name}", value)
         for scene, episodes in found.items():
-            if len(found) > 1:
-                exclude = _SCREEN if len(scene) > _LONGEST_SCENE else None
-                for name, value in means(episodes).items():
-                    logger.record(f"eval/{scene}/{name}", value, exclude)
+            for name, value in means(episodes).items() if len(found) > 1 else ():
+                record(logger, f"eval/{scene}/{name}", value)
             logger.record(f"eval/{scene}/trajectory", self._picture(scene, episodes), exclude=_NO_PICTURES)
         if self._score not in figures:
             raise MissingInfoError(

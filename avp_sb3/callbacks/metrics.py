@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from avp_habitat.command import progress
 from avp_habitat.metrics import coverage_per_view
-from avp_sb3.callbacks.base import MissingInfoError, finished_episodes, required
+from avp_sb3.callbacks.base import MissingInfoError, finished_episodes, record, required
 from avp_sb3.evaluation.policy import RETURN
 
 _READER, _INSIDE = "MetricsCallback", "info['avp_episode']"
@@ -139,4 +139,4 @@ class MetricsCallback(BaseCallback):
 
     def _record(self) -> None:
         for name, value in self._window.means().items():
-            self.logger.record(name, value)
+            record(self.logger, name, value)
