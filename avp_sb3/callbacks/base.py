@@ -26,7 +26,7 @@ class LoggedFile:
 
 
 _LONGEST = 33
-"""Letters of a name behind its first `/` on the screen: SB3 cuts longer ones, and refuses two that it cut to the same."""
+"""Letters behind the first `/` of a name: SB3 cuts longer ones on the screen, and refuses two that are then equal."""
 
 
 def record(logger: Logger, name: str, value: float) -> None:

@@ -38,12 +38,11 @@ class EvaluationCallback(BaseCallback):
 
         callback: [{avp_sb3.EvaluationCallback: {scenes: ["builtin:7"], every: 50000}}]
 
-    It logs `eval/coverage`, `eval/views`, `eval/cpv`, `eval/annd_m`, `eval/ei`, `eval/coverage_area`, `eval/return` and
-    the other figures of `avp_sb3.evaluate` (means over all scenes and episodes), per scene `eval/SCENE/coverage` … when
-    there are several, a picture `eval/SCENE/trajectory` (the first start's path, and coverage by view), and
-    `eval/best_SCORE` with the model itself when it is better than before. The last evaluation is that of the finished
-    model; an interrupted training has none. The training's environment and random numbers are not touched: with or
-    without this callback the same weights come out.
+    It logs `eval/FIGURE`, the means of the figures of `avp_sb3.evaluate` and of `return` over all scenes and episodes,
+    with several scenes also `eval/SCENE/FIGURE`, a picture `eval/SCENE/trajectory` (the first start's path, and
+    coverage by view), and `eval/best_SCORE` with the model itself when it is better than before. The last evaluation is
+    that of the finished model; an interrupted training has none. The training's environment and random numbers are not
+    touched: with or without this callback the same weights come out.
     """
 
     def __init__(
@@ -69,13 +68,13 @@ class EvaluationCallback(BaseCallback):
 
         Args:
             scenes: each as `avp_habitat.scenes.location.locate` takes it; `builtin:7` when omitted.
-            eval_env: instead of scenes: an environment of its own whose `info` holds `avp_episode` at the end of an
-                episode. With `coverage` in every `info` there is a curve, with attributes `scene_name`, `area` and
-                `settings` (those of `AVP-v0`) there are figures per scene, maps, and figures of the whole budget.
+            eval_env: instead of scenes: an environment whose `info` holds `avp_episode` at the end of an episode. With
+                `coverage` in every `info` there is a curve, with attributes `scene_name`, `area` and `settings` (as of
+                `AVP-v0`) there are figures per scene, maps, and figures of the whole budget.
             every: environment steps of all agents together between two evaluations.
             episodes: in each scene.
-            seed: episode i of a scene starts from `seed + i`, as in `avp_sb3.evaluate`. An `eval_env` with fewer
-                environments than episodes has this only for the first ones; the others follow from them.
+            seed: episode i of a scene starts from `seed + i`, as in `avp_sb3.evaluate`; in an `eval_env` with fewer
+                environments than episodes the first ones do.
             deterministic: take the likeliest actions. False samples them, which is the fairer test of a policy that
                 trains with sampled ones (docs/training.md), with the same random numbers each time.
             at_start: evaluate before the first step, too, which also prepares the tables of the scenes.
@@ -85,9 +84,9 @@ class EvaluationCallback(BaseCallback):
                 none. A file that exists is refused unless the training that made it goes on.
             settings: of the task; those of the training's environment when omitted, also whether views are looked up.
             simulator: that opens the scenes; with `habitat` each of them is in a process of its own.
-            gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
-            navmesh: file of the only scene's NavMesh; computed when omitted.
-            up: axis of mesh files that points up, `y` or `z`; of each file what is known of it when omitted.
+            gpu: as of `AVPVecEnv`.
+            navmesh: as of `AVPVecEnv`.
+            up: as of `AVPVecEnv`.
             verbose: 1 prints at the end where the best model is, 2 also when a better one is kept; 0 prints nothing.
 
         Raises:

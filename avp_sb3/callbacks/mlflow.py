@@ -133,14 +133,14 @@ class MLflowCallback(BaseCallback):
         """Describe the run; nothing is contacted before the training starts.
 
         Args:
-            experiment: MLflow experiment, made when it does not exist; when omitted, what `mlflow.set_experiment`,
-                `MLFLOW_EXPERIMENT_ID` or `MLFLOW_EXPERIMENT_NAME` say, else `avp`. Not used within an active run.
-            run_name: name of the run; when omitted, algorithm, reward, scene and seed.
-            tracking_uri: where runs are kept; when omitted, what `mlflow.set_tracking_uri` or `MLFLOW_TRACKING_URI`
-                say, else `sqlite:///mlflow.db` in the current folder.
+            experiment: MLflow experiment, made when it does not exist; when omitted, what MLflow's functions or
+                variables say, else `avp`. Not used within an active run.
+            run_name: when omitted, algorithm, reward, scene and seed.
+            tracking_uri: where runs are kept; when omitted, what MLflow's functions or variables say, else
+                `sqlite:///mlflow.db` in the current folder.
             run_id: go on with this run; when omitted, with the model's own if it was interrupted.
-            log_model: keep the model as artifact `model.zip`, at the end unless the training failed, and on the way;
-                with `model_vecnormalize.pkl` where it trains under `VecNormalize`.
+            log_model: keep the model (with the statistics of `VecNormalize`) as artifact `model.zip`, on the way and at
+                the end unless the training failed.
             checkpoint_s: seconds between two models that are kept on the way, each in place of the one before.
             offline: True goes on when the server does not answer at the start, and sends everything later; when
                 omitted, as the variable `AVP_MLFLOW_OFFLINE` says.

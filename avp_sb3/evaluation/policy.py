@@ -175,9 +175,9 @@ def evaluate_policy(
         seed: of the first episode.
         settings: of the task; the design's defaults when omitted. Visibility is always computed, never looked up.
         simulator: the simulator's name.
-        gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
-        navmesh: file of the scene's NavMesh; computed when omitted.
-        up: axis of a mesh file that points up, `y` or `z`; what is known of the file when omitted.
+        gpu: as of `SimulatorChoice`.
+        navmesh: as of `SimulatorChoice`.
+        up: as of `SimulatorChoice`.
         **options: `observation`, `stochastic` and `trusted` of `PolicyRunner`.
 
     Raises:

@@ -3,6 +3,7 @@
 import signal
 import time
 import traceback
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -89,18 +90,16 @@ class AVPSubprocVecEnv(SubprocVecEnv):
         """Start the workers, and wait until all scenes are open.
 
         Args:
-            scene: as `avp_habitat.scenes.location.locate` takes it, or several; agent i walks in scene i modulo their
-                number.
+            scene: as of `AVPVecEnv`, like all that is not named here.
             agents: n, at least one for each worker; one for each when omitted.
             workers: processes, a multiple of the number of scenes; one for each scene when omitted. Agent i is of
                 worker i modulo their number.
-            simulator: `raycast` or `habitat`.
-            gpu: the CUDA device of `habitat`, or several, of which worker i takes number i modulo their number; -1
-                for none, None for the first one there is.
-            navmesh: file of the only scene's NavMesh; computed when omitted.
-            up: axis of mesh files that points up, `y` or `z`; of each file what is known of it when omitted.
-            settings: of the task; when omitted, the design's defaults, looked up where the simulator casts rays.
-            seed: of the starts; agent i uses `seed + i`.
+            simulator: its name.
+            gpu: the CUDA device of `habitat`, or several, of which worker i takes number i modulo their number.
+            navmesh: as of `AVPVecEnv`.
+            up: as of `AVPVecEnv`.
+            settings: as of `AVPVecEnv`.
+            seed: as of `AVPVecEnv`.
             start_method: `forkserver` or `spawn`; a forked process cannot use a graphics device.
 
         Raises:
@@ -116,7 +115,11 @@ class AVPSubprocVecEnv(SubprocVecEnv):
             raise UsageError(f"start_method: expected one of {', '.join(START_METHODS)}, got {start_method!r}")
         self.scenes = scenes_given(scene, choices[0])
         """Of the agents in turn, as given."""
-        self._count = count = _workers(workers, len(self.scenes))
+        count = len(self.scenes) if workers is None else workers
+        if count < 1 or count % len(self.scenes):
+            there_are = "there is 1 scene" if len(self.scenes) == 1 else f"there are {len(self.scenes)} scenes"
+            raise UsageError(f"workers: expected {len(self.scenes)} or a multiple of it, as {there_are}, got {workers}")
+        self._count, self._workers = count, range(count)
         agents = count if agents is None else agents
         if agents < count:
             raise UsageError(f"agents: expected at least {count}, one for each worker, got {agents}")
@@ -130,14 +133,14 @@ class AVPSubprocVecEnv(SubprocVecEnv):
                 agents=len(range(worker, agents, count)),
                 **vars(choices[worker % len(choices)]),
             )
-            for worker in range(count)
+            for worker in self._workers
         ]
         try:
             with self._named_death(0, _GUARD):
                 super().__init__(makes, start_method=start_method)
             # SB3 has counted the workers.
             VecEnv.__init__(self, agents, self.observation_space, self.action_space)
-            self._fixed = {name: self._of_agents(range(count), "get_attr", name) for name in _FIXED}
+            self._fixed = {name: self._of_agents(self._workers, "get_attr", name) for name in _FIXED}
         except BaseException:
             self.close()
             raise
@@ -145,21 +148,18 @@ class AVPSubprocVecEnv(SubprocVecEnv):
 
     def reset(self) -> NDArray[np.float32]:  # type: ignore[override]
         """Start all episodes at random; `(n, 12)`, longer with a map."""
-        self._ask("seed_agents", {worker: (self._seeds[worker :: self._count],) for worker in range(self._count)})
-        answers = self._ask("reset", {worker: () for worker in range(self._count)})
+        self._send_parts("seed_agents", self._seeds)
+        self._receive()
+        self._send("reset", {worker: ((), {}) for worker in self._workers})
+        observations = self._receive().values()
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{"coverage": 0.0, "views": 0} for _ in range(self.num_envs)]
-        return self._joined(answers.values())
-
-    def seed_agents(self, seeds: Sequence[int | None]) -> None:
-        """Seed the starts of the next `reset`, `(n,)`; None leaves an agent's generator as it is."""
-        self._seeds = list(seeds)
+        return self._joined(observations)
 
     def step_async(self, actions: NDArray[np.integer]) -> None:
         """Send the `(n,)` actions to the workers."""
-        actions = np.asarray(actions)
-        self._send("step", {worker: (actions[worker :: self._count],) for worker in range(self._count)})
+        self._send_parts("step", np.asarray(actions))
 
     def step_wait(self) -> tuple[NDArray, NDArray, NDArray, list[dict[str, Any]]]:  # type: ignore[override]
         """What all agents saw; those whose episode ended start the next one, as SB3 expects."""
@@ -192,7 +192,10 @@ class AVPSubprocVecEnv(SubprocVecEnv):
         """Whether `get_attr` knows the name."""
         if attr_name in ("settings", "render_mode", *_FIXED):
             return True
-        return attr_name != "simulator" and self._ask("has_attr", {0: (attr_name,)})[0]
+        if attr_name == "simulator":
+            return False
+        self._send("has_attr", {0: ((attr_name,), {})})
+        return self._receive()[0]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Refused: the agents share one task, whose settings are frozen."""
@@ -208,29 +211,26 @@ class AVPSubprocVecEnv(SubprocVecEnv):
 
     def _of_agents(self, rows: Iterable[int], method: str, *args: Any, **kwargs: Any) -> list[Any]:
         """Answers for agents, in the order of `rows`; each worker is asked once."""
-        rows = list(rows)
-        own: dict[int, list[int]] = {}
+        rows, own = list(rows), defaultdict(list)
         for row in rows:
-            own.setdefault(row % self._count, []).append(row // self._count)
-        self._send(method, dict.fromkeys(own, args), {worker: kwargs | {"indices": own[worker]} for worker in own})
+            own[row % self._count].append(row // self._count)
+        self._send(method, {worker: (args, kwargs | {"indices": indices}) for worker, indices in own.items()})
         answers = {worker: iter(answer) for worker, answer in self._receive().items()}
         return [next(answers[row % self._count]) for row in rows]
 
-    def _ask(self, method: str, requests: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
-        self._send(method, requests)
-        return self._receive()
-
-    def _send(
-        self, method: str, requests: Mapping[int, tuple[Any, ...]], kwargs: Mapping[int, dict[str, Any]] | None = None
-    ) -> None:
-        """Ask some workers, by their numbers; `_receive` waits for what they answer."""
+    def _send(self, method: str, requests: Mapping[int, tuple[tuple[Any, ...], dict[str, Any]]]) -> None:
+        """Ask workers, by their numbers; `_receive` waits for what they answer."""
         if self.closed:
             raise SimulatorError("AVPSubprocVecEnv: its workers were ended; make a new one")
         self._answers()  # To a request whose asker was interrupted.
-        for worker, args in requests.items():
+        for worker, (args, kwargs) in requests.items():
             with self._named_death(worker):
-                self.remotes[worker].send(("env_method", ("call", (method, *args), (kwargs or {}).get(worker, {}))))
+                self.remotes[worker].send(("env_method", ("call", (method, *args), kwargs)))
             self._asked.append(worker)
+
+    def _send_parts(self, method: str, values: Sequence[Any] | NDArray) -> None:
+        """Ask all workers, each with its agents' part of the `(n,)` values."""
+        self._send(method, {worker: ((values[worker :: self._count],), {}) for worker in self._workers})
 
     def _receive(self) -> dict[int, Any]:
         """Answers by the worker's number; the first that is an error is raised with the worker and its scene."""
@@ -290,12 +290,3 @@ def _end(processes: Sequence[BaseProcess]) -> None:
         until = time.monotonic() + _GRACE_S
         for process in late:
             process.join(max(0.0, until - time.monotonic()))
-
-
-def _workers(workers: int | None, scenes: int) -> int:
-    if workers is None:
-        return scenes
-    if workers < 1 or workers % scenes:
-        there_are = "there is 1 scene" if scenes == 1 else f"there are {scenes} scenes"
-        raise UsageError(f"workers: expected {scenes} or a multiple of it, as {there_are}, got {workers}")
-    return workers
