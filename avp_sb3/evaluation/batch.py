@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from copy import deepcopy
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -37,27 +36,16 @@ def check_fit(model: BaseAlgorithm, training: VecEnv, env: VecEnv) -> None:
     """
     if training.unwrapped is env.unwrapped:
         raise UsageError(f"{READER} eval_env: is the training's own environment; expected another one")
-    ours = {"observation_space": _expected_space(model, env), "action_space": model.action_space}
-    for kind, expected in ours.items():
+    normalised, own = model.get_vec_normalize_env(), unwrap_vec_normalize(env)
+    if own is not None and normalised is None:
+        raise UsageError(f"{READER} eval_env: is wrapped in VecNormalize, but the training's environment is not")
+    seen = model.observation_space if own is not None or normalised is None else normalised.venv.observation_space
+    for kind, expected in (("observation_space", seen), ("action_space", model.action_space)):
         if expected != getattr(env, kind):
             raise UsageError(
                 f"{READER}: expected the {kind} of the policy, {expected}, but the evaluation's environment has "
                 f"{getattr(env, kind)}; wrap an eval_env as the training's environment is wrapped"
             )
-
-
-def _expected_space(model: BaseAlgorithm, env: VecEnv) -> gymnasium.Space | None:
-    normalised, own = model.get_vec_normalize_env(), unwrap_vec_normalize(env)
-    if own is not None and normalised is None:
-        raise UsageError(f"{READER} eval_env: is wrapped in VecNormalize, but the training's environment is not")
-    if own is not None or normalised is None:
-        return model.observation_space
-    if model.observation_space != normalised.observation_space:
-        raise UsageError(
-            f"{READER}: the training's environment changes observations after VecNormalize; expected an eval_env that "
-            "is wrapped in the same way"
-        )
-    return normalised.venv.observation_space
 
 
 @contextmanager

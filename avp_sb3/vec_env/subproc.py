@@ -34,7 +34,7 @@ _HINTS = {
     "SIGSEGV": " (a crash inside the simulator)",
     "SIGABRT": " (a crash inside the simulator)",
 }
-_FIXED = ("area", "scene_name", "scene_digest")
+_FIXED = ("area", "scene_name", "scene_digest", "settings", "render_mode")
 """Attributes that never change: known also when the workers have ended, so that the last path can be drawn."""
 
 
@@ -70,8 +70,6 @@ class AVPSubprocVecEnv(SubprocVecEnv):
 
     A worker that fails or ends becomes one error that names it and its scene; where it has ended, so do the others.
     """
-
-    render_mode = None
 
     def __init__(
         self,
@@ -125,6 +123,7 @@ class AVPSubprocVecEnv(SubprocVecEnv):
             raise UsageError(f"agents: expected at least {count}, one for each worker, got {agents}")
         self.settings = settings or TaskSettings(lookup=simulator == "raycast")
         self._asked: list[int] = []
+        self._fixed: dict[str, list[Any]] = {}
         makes = [
             partial(
                 _Agents,
@@ -182,18 +181,14 @@ class AVPSubprocVecEnv(SubprocVecEnv):
         rows = self._get_indices(indices)
         if attr_name == "simulator":
             raise UsageError("AVPSubprocVecEnv: simulator stays in its process; ask for area, scene_name or agent_view")
-        if attr_name in ("settings", "render_mode"):
-            return [getattr(self, attr_name) for _ in rows]
-        if attr_name in _FIXED:
+        if attr_name in self._fixed:
             return [self._fixed[attr_name][row % self._count] for row in rows]
         return self._of_agents(rows, "get_attr", attr_name)
 
     def has_attr(self, attr_name: str) -> bool:
         """Whether `get_attr` knows the name."""
-        if attr_name in ("settings", "render_mode", *_FIXED):
-            return True
-        if attr_name == "simulator":
-            return False
+        if attr_name in self._fixed or attr_name == "simulator":
+            return attr_name != "simulator"
         self._send("has_attr", {0: ((attr_name,), {})})
         return self._receive()[0]
 
