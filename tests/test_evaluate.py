@@ -125,7 +125,7 @@ def test_a_model_gets_the_observation_it_was_trained_on_and_exact_rays(model):
 
 def result(policy="mine", episodes=3, **changes):
     rng = np.random.default_rng(len(policy))
-    figures = {name: rng.random(episodes) for name in ("coverage", "views", "ei")}
+    figures = {name: rng.random(episodes) for name in ("coverage", "views", "ei", "sofas seen")}
     return PolicyResult(policy, np.arange(5, 5 + episodes), rng.random((episodes, 4)), figures, **changes)
 
 
@@ -165,6 +165,7 @@ def test_the_table_shows_means_with_their_intervals_in_percent():
     coverage = next(row for row in rows if row[0] == "coverage [%]")
     assert coverage[1] == f"{mean:.1f} ± {half:.1f}"
     assert re.fullmatch(r"\d+\.\d", coverage[2])
+    assert "sofas seen" in {row[0] for row in rows}, "a figure that the suite does not list"
     assert rows[-1] == ["episodes", "3", "1"]
     assert rows[-2][:2] == [
         "CpV [%/view]",
