@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
-from avp_sb3.evaluation.policy import mean_and_half_width
+from avp_habitat.metrics import mean_and_half_width
 
 ROOT = Path(__file__).resolve().parent.parent
 BASELINES = ("heuristic", "random", "spin", "frontier", "greedy", "oracle")

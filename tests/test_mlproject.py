@@ -4,11 +4,15 @@ import runpy
 import shlex
 import subprocess
 import sys
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import get_type_hints
 
 import mlflow.projects
 import pytest
 import yaml
+
+from avp_habitat import command
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = yaml.safe_load((ROOT / "MLproject").read_text(encoding="utf-8"))
@@ -28,7 +32,9 @@ def options_of(words):
     name, *rest = words[3:] if words[2] == "avp_experiment.part" else words[2:]
     if name.endswith(".py"):
         return runpy.run_path(str(ROOT / name))["_parser"]().parse_args(rest)
-    return importlib.import_module(name)._parser().parse_args(rest)
+    program = importlib.import_module(name)
+    kind = next(iter(get_type_hints(program.main).values()))
+    return command.parse(kind, rest) if is_dataclass(kind) else program._parser().parse_args(rest)
 
 
 def test_the_project_has_the_entry_points_that_its_page_shows():
