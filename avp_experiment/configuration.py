@@ -1,20 +1,20 @@
-"""What an experiment's figures depend on, kept beside them so that a folder never mixes two experiments."""
+"""What an experiment consists of: methods, scenes, and a preset for each kind of machine and purpose."""
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from avp_experiment.presets import Preset
-from avp_habitat.errors import AVPError, UsageError, unknown_name
+from avp_habitat.errors import UsageError, unknown_name
 from avp_habitat.policies.registry import POLICY_NAMES
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.task.rewards import REWARD_NAMES
 
+TRAIN, UNSEEN = "train", "unseen"
+"""Roles of scenes: policies are trained in the former, never in the latter."""
 ROOMS = "_rooms"
 """A learned method whose name ends so is trained in generated rooms, never in the scenes of the experiment."""
-_WITHOUT_STOP = "coverage"
+_FIRST_ROOM = 100
 
 
 @dataclass(frozen=True)
@@ -23,22 +23,21 @@ class Method:
 
     name: str
     """In files and tables."""
-    reward: str
+    reward: str = "coverage"
     """What it learns from; of a baseline, which has no use for it, one without a stop."""
-    learned: bool
+    learned: bool = False
     """Whether it is trained."""
-    rooms: bool = False
-    """Whether it is trained in generated rooms."""
+
+    @property
+    def in_rooms(self) -> bool:
+        """Whether it is trained in generated rooms."""
+        return self.learned and self.name.endswith(ROOMS)
 
 
-METHODS = {
-    name: Method(name, _WITHOUT_STOP, learned=False) for name in POLICY_NAMES
-} | {
-    reward + suffix: Method(reward + suffix, reward, learned=True, rooms=bool(suffix))
-    for suffix in ("", ROOMS)
-    for reward in REWARD_NAMES
-}  # fmt: skip
-"""By name."""
+METHODS = {name: Method(name) for name in POLICY_NAMES} | {
+    reward + suffix: Method(reward + suffix, reward, learned=True) for suffix in ("", ROOMS) for reward in REWARD_NAMES
+}
+"""By name: baselines, rewards, rewards trained in rooms."""
 BASELINES = ("heuristic", "random", "frontier", "greedy", "oracle", "survey")
 """What learned policies are compared with by default; the last two plan with full knowledge, for floor and for all
 surfaces."""
@@ -47,29 +46,58 @@ DEFAULT = (*BASELINES, *REWARD_NAMES, f"proposed{ROOMS}", f"surface{ROOMS}")
 
 
 def chosen_methods(names: Iterable[str]) -> tuple[Method, ...]:
-    """The methods of these names, in the order of `METHODS`' tables.
+    """The methods of these names, each once, in the order of `METHODS`.
 
     Raises:
         UsageError: no such method, with the nearest name, or none at all.
     """
-    names = list(names)
-    for name in names:
-        if name not in METHODS:
-            raise unknown_name("method", name, METHODS)
-    if not names:
-        raise UsageError("methods: expected at least one, got none")
-    return tuple(METHODS[name] for name in in_order(names))
-
-
-def in_order(names: Iterable[str]) -> Sequence[str]:
-    """Each name once: baselines first, then rewards, then those trained in rooms."""
     wanted = set(names)
-    return [name for name in METHODS if name in wanted]
+    if not wanted:
+        raise UsageError("methods: expected at least one, got none")
+    for name in wanted - set(METHODS):
+        raise unknown_name("method", name, METHODS)
+    return tuple(method for name, method in METHODS.items() if name in wanted)
 
 
-FORMAT = 1
-FILE = "experiment.json"
-_FIRST_ROOM = 100
+@dataclass(frozen=True)
+class Preset:
+    """Everything about an experiment but its scenes, methods and simulator."""
+
+    steps: int
+    """Environment steps of a training in the scenes."""
+    steps_rooms: int
+    """Environment steps of a training in generated rooms."""
+    seeds: int = 3
+    """Trainings of each reward, and places to start from."""
+    starts: int = 1
+    """Episodes of each method, scene and seed."""
+    observation: str = "map"
+    """What the policies observe; `map` becomes what the reward `surface` needs for that reward."""
+    rooms: int = 16
+    """How many generated rooms."""
+    size: tuple[int, int] = (640, 480)
+    """Width and height of the pictures in pixels."""
+    reconstruction: str = "avp-nerfacto"
+    """nerfstudio's method."""
+    iterations: int = 30_000
+    """Of each reconstruction."""
+    prefixes: tuple[int, ...] = (20, 40, 60)
+    """Each episode is also reconstructed from its first so many frames."""
+    budget: int = 80
+    """T: most views of an episode."""
+    heldout_pictures: tuple[int, ...] = (3, 11, 16)
+    """Held-out views whose renders are kept."""
+
+
+PRESETS = {
+    "demo": Preset(300_000, 300_000, seeds=1, rooms=2, size=(192, 144), iterations=1000, prefixes=()),
+    "smoke": Preset(24_576, 24_576, seeds=1, rooms=2, size=(96, 72), iterations=100, prefixes=(40,)),
+    "cpu": Preset(700_000, 700_000, size=(192, 144), iterations=300, prefixes=(20, 40)),
+    "gpu": Preset(1_000_000, 2_000_000, starts=3),
+    "paper": Preset(300_000, 300_000, observation="numbers", reconstruction="nerfacto"),
+}
+"""demo: one good training, no curves (`make demo`). smoke: minutes, to see that everything works. cpu: two to three
+hours on two cores. gpu: the same questions at full size. paper: the paper's observation, steps and reconstruction."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +111,7 @@ class Scene:
     sha256: str
     """Of its content."""
     role: str
-    """`train`: policies are trained in it. `unseen`: they are not."""
+    """`TRAIN` or `UNSEEN`."""
 
     @property
     def slug(self) -> str:
@@ -103,9 +131,7 @@ class Configuration:
     preset_name: str
     """Of the preset."""
     preset: Preset
-    """Its values."""
-    seeds: int
-    """Trainings of each reward."""
+    """Its values, some of them perhaps replaced by the user."""
     scenes: tuple[Scene, ...]
     """Of training first, then unseen ones."""
     methods: tuple[Method, ...]
@@ -129,11 +155,11 @@ class Configuration:
 
     def as_json(self) -> dict[str, Any]:
         """Scenes, preset and its values as the results state them."""
-        scenes = [{"name": scene.name, "sha256": scene.sha256, "role": scene.role} for scene in self.scenes]
         values = asdict(self.preset)
         width, height = values.pop("size")
         values |= {name: list(values[name]) for name in ("prefixes", "heldout_pictures")}
-        values |= {"rooms": list(self.rooms), "seeds": self.seeds, "width": width, "height": height}
+        values |= {"rooms": list(self.rooms), "width": width, "height": height}
+        scenes = [{"name": scene.name, "sha256": scene.sha256, "role": scene.role} for scene in self.scenes]
         return {"preset": self.preset_name, **values, "simulator": self.simulator, "scenes": scenes}
 
 
@@ -147,7 +173,7 @@ def read_scenes(train: Sequence[str], unseen: Sequence[str], choice: SimulatorCh
     if not train:
         raise UsageError("scene: expected at least one scene of training, got none")
     found: list[Scene] = []
-    for role, specs in (("train", train), ("unseen", unseen)):
+    for role, specs in ((TRAIN, train), (UNSEEN, unseen)):
         for spec in specs:
             opened = open_simulator(choice, spec)
             _ = opened.area
@@ -166,56 +192,3 @@ def _check_different(scene: Scene, other: Scene) -> None:
         )
     if scene.slug == other.slug:
         raise UsageError(f"{scene.spec}: has the same name as {other.spec}; expected scenes of different names")
-
-
-def keep(configuration: Configuration, folder: Path) -> None:
-    """Write the configuration into the experiment's folder, or hold it against the one that is there.
-
-    Raises:
-        UsageError: the folder holds something else, or an experiment of another configuration.
-        AVPError: nothing can be written there.
-    """
-    path, wanted = folder / FILE, _fixed(configuration.as_json())
-    if path.exists():
-        known = _fixed(_known(path))
-        if different := sorted(name for name in {*wanted, *known} if wanted.get(name) != known.get(name)):
-            raise UsageError(
-                f"out: {folder} holds an experiment of another configuration: "
-                f"{_differences(different, known, wanted)}; name another folder, or remove it"
-            )
-        return
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UsageError(f"out: {folder} is no experiment's folder (it has no {FILE}); expected a new or empty folder")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(".part")
-        temporary.write_text(json.dumps({"format": FORMAT, **wanted}, indent=1) + "\n", encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        raise AVPError(f"out: {folder}: cannot write there: {error.strerror}") from None
-
-
-def _fixed(values: dict[str, Any]) -> dict[str, Any]:
-    """What may not change within a folder; methods and starts may be added."""
-    return {name: value for name, value in values.items() if name != "starts"}
-
-
-def _known(path: Path) -> dict[str, Any]:
-    try:
-        known = json.loads(path.read_text(encoding="utf-8"))
-        version = known.pop("format")
-    except (OSError, ValueError, KeyError, AttributeError) as error:
-        raise AVPError(f"{path}: expected an experiment's configuration, could not read it: {error}") from None
-    if version != FORMAT:
-        raise AVPError(f"{path}: expected format {FORMAT}, found {version!r}")
-    return known
-
-
-def _differences(names: Sequence[str], known: dict[str, Any], wanted: dict[str, Any]) -> str:
-    def short(value: Any) -> str:
-        if isinstance(value, list) and value and isinstance(value[0], dict):
-            return ", ".join(f"{one['name']} ({one['role']})" for one in value)
-        text = str(value)
-        return text if len(text) <= 60 else f"{text[:57]}..."
-
-    return "; ".join(f"{name} {short(known.get(name))} there, {short(wanted.get(name))} asked for" for name in names)
