@@ -1,9 +1,11 @@
 """The experiment's cells: every training, rollout and reconstruction as a command line, and what is kept of it."""
 
+import base64
 import csv
 import json
 import os
 import shlex
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ import numpy as np
 
 from avp_experiment.configuration import TRAIN as TRAIN_SCENE
 from avp_experiment.configuration import Configuration, Method, Scene
-from avp_habitat.errors import AVPError
+from avp_habitat.errors import AVPError, RolloutError
 
 TRAIN, COLLECT, RECONSTRUCT = "train", "collect", "reconstruct"
 _MADE = {TRAIN: "model.zip", COLLECT: "rollout", RECONSTRUCT: "reconstruction"}
@@ -114,7 +116,9 @@ class _Planner:
 
     def rollout(self, method: Method, seed: int, scene: Scene, start: int, training: Cell | None) -> Cell:
         preset, (width, height) = self.configuration.preset, self.configuration.preset.size
-        policy = ["--policy", str(training.output(self.root)), "--stochastic"] if training else ["--policy", method.name]
+        policy = (
+            ["--policy", str(training.output(self.root)), "--stochastic"] if training else ["--policy", method.name]
+        )
         name = f"{method.name}-{scene.slug}-{seed}-{start}"
         words = ["python", "-m", "avp_habitat.collect", "--scene", scene.spec, *policy, "--reward", method.reward]
         # Every method starts at the same places.
@@ -190,6 +194,45 @@ def _of_rollout(folder: Path) -> dict[str, Any]:
         "coverage_curve": coverage,
         "visibility_curve": [round(float(share), 6) for share in seen.curve()],
     }
+
+
+def floor_map(folder: Path) -> dict[str, Any] | None:
+    """The map of a rollout as `results.json` keeps it; None for a rollout that was written without its floor.
+
+    Args:
+        folder: of the rollout.
+
+    Raises:
+        RolloutError: the folder, its floor or its `steps.csv` cannot be used.
+    """
+    from avp_habitat.rollout.format import read_rollout
+    from avp_habitat.rollout.images import read_numbers
+
+    floor = read_rollout(folder).floor
+    if floor is None:
+        return None
+    numbers = read_numbers(floor.picture).astype("<u2")
+    return {
+        "cell_m": floor.cell_m,
+        "origin_m": list(floor.origin_m),
+        "shape": list(floor.shape),
+        "floor": base64.b64encode(zlib.compress(numbers.tobytes(), 9)).decode("ascii"),
+        "path": _path(folder / "steps.csv"),
+    }
+
+
+def _path(steps: Path) -> list[list[float]]:
+    """`[x, z, yaw]` after each step, in metres and radians."""
+    try:
+        with steps.open(newline="", encoding="utf-8") as file:
+            rows = [[round(float(row[name]), 4) for name in ("x_m", "z_m", "yaw_rad")] for row in csv.DictReader(file)]
+    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
+        raise RolloutError(
+            f"{steps}: expected x_m, z_m and yaw_rad of every step, could not read them: {error!r}"
+        ) from None
+    if not np.isfinite(rows).all():
+        raise RolloutError(f"{steps}: expected finite positions and angles, found others")
+    return rows
 
 
 def _of_reconstruction(folder: Path) -> dict[str, Any]:

@@ -98,7 +98,9 @@ class Folder:
                 f"out: {self.root}: the {len(left)} cells to do need about {_size(needed)}, and {_size(free)} are "
                 "free there; name a folder on another disk, or a smaller preset, fewer seeds, starts or methods"
             )
-        print(f"{len(left)} of {len(cells)} cells to do, about {_size(needed)} of disk ({_size(free)} free): {self.root}")
+        print(
+            f"{len(left)} of {len(cells)} cells to do, about {_size(needed)} of disk ({_size(free)} free): {self.root}"
+        )
 
 
 def open_folder(configuration: Configuration, root: Path) -> Folder:
