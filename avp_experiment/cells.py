@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from avp_experiment.configuration import TRAIN as TRAIN_SCENE
-from avp_experiment.configuration import Configuration, Method, Scene
-from avp_habitat.errors import AVPError, RolloutError
+from avp_experiment.configuration import Configuration, Method, Scene, scene_slug
+from avp_habitat.errors import AVPError
 
 TRAIN, COLLECT, RECONSTRUCT = "train", "collect", "reconstruct"
 _MADE = {TRAIN: "model.zip", COLLECT: "rollout", RECONSTRUCT: "reconstruction"}
@@ -119,7 +119,7 @@ class _Planner:
         policy = (
             ["--policy", str(training.output(self.root)), "--stochastic"] if training else ["--policy", method.name]
         )
-        name = f"{method.name}-{scene.slug}-{seed}-{start}"
+        name = f"{method.name}-{scene_slug(scene.name)}-{seed}-{start}"
         words = ["python", "-m", "avp_habitat.collect", "--scene", scene.spec, *policy, "--reward", method.reward]
         # Every method starts at the same places.
         words += ["--seed", str(_START_SEEDS * (1 + start) + seed), "--budget", str(preset.budget)]
@@ -187,23 +187,29 @@ def _of_rollout(folder: Path) -> dict[str, Any]:
 
     rollout = read_rollout(folder)
     seen = visibility_of(rollout.frames, rollout.heldout, rollout.intrinsics)
-    with (folder / "steps.csv").open(newline="", encoding="utf-8") as file:
-        coverage = [round(float(row["coverage"]), 6) for row in csv.DictReader(file)]
     return {
         "metrics": rollout.meta["metrics"] | seen.figures(),
-        "coverage_curve": coverage,
+        "coverage_curve": [round(float(row["coverage"]), 6) for row in _steps(folder)],
         "visibility_curve": [round(float(share), 6) for share in seen.curve()],
     }
 
 
+def _steps(folder: Path) -> list[dict[str, str]]:
+    with (folder / "steps.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
 def floor_map(folder: Path) -> dict[str, Any] | None:
-    """The map of a rollout as `results.json` keeps it; None for a rollout that was written without its floor.
+    """The map of a rollout as `results.json` keeps it, with `[x, z, yaw]` after each step in metres and radians.
 
     Args:
         folder: of the rollout.
 
+    Returns:
+        None for a rollout that was written without its floor.
+
     Raises:
-        RolloutError: the folder, its floor or its `steps.csv` cannot be used.
+        RolloutError: the folder or its floor cannot be read.
     """
     from avp_habitat.rollout.format import read_rollout
     from avp_habitat.rollout.images import read_numbers
@@ -217,22 +223,8 @@ def floor_map(folder: Path) -> dict[str, Any] | None:
         "origin_m": list(floor.origin_m),
         "shape": list(floor.shape),
         "floor": base64.b64encode(zlib.compress(numbers.tobytes(), 9)).decode("ascii"),
-        "path": _path(folder / "steps.csv"),
+        "path": [[round(float(row[name]), 4) for name in ("x_m", "z_m", "yaw_rad")] for row in _steps(folder)],
     }
-
-
-def _path(steps: Path) -> list[list[float]]:
-    """`[x, z, yaw]` after each step, in metres and radians."""
-    try:
-        with steps.open(newline="", encoding="utf-8") as file:
-            rows = [[round(float(row[name]), 4) for name in ("x_m", "z_m", "yaw_rad")] for row in csv.DictReader(file)]
-    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
-        raise RolloutError(
-            f"{steps}: expected x_m, z_m and yaw_rad of every step, could not read them: {error!r}"
-        ) from None
-    if not np.isfinite(rows).all():
-        raise RolloutError(f"{steps}: expected finite positions and angles, found others")
-    return rows
 
 
 def _of_reconstruction(folder: Path) -> dict[str, Any]:

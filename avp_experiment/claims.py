@@ -18,7 +18,8 @@ from avp_experiment.statistics import (
     summary,
     views_to_reach,
 )
-from avp_experiment.tables import NOTHING, aligned
+from avp_experiment.tables import NOTHING
+from avp_habitat.tables import table
 
 PAIRS = (("surface", "proposed"), (f"surface{ROOMS}", f"proposed{ROOMS}"))
 """Compared: the same training, another reward."""
@@ -69,9 +70,12 @@ def _heuristic(results: Results) -> list[str]:
         if not found:
             lines.append(f"{where.capitalize()}: nothing to compare (no episodes of `heuristic` and a learned policy).")
             continue
-        rows = [["learned − heuristic", *map(_heading, names)]]
-        rows += [[method, *map(_difference, both, names)] for method, both in found.items()]
-        lines += [f"{where.capitalize()} the heuristic is {_below(list(found.values()))}.", aligned(rows)]
+        head = ["learned − heuristic", *map(_heading, names)]
+        rows = [[method, *map(_difference, both, names)] for method, both in found.items()]
+        lines += [
+            f"{where.capitalize()} the heuristic is {_below(list(found.values()))}.",
+            table(head, rows, words=1),
+        ]
     return lines
 
 
@@ -93,25 +97,18 @@ def _fewer_views(results: Results) -> list[str]:
         views, psnr = (
             [results.values(method, role, name) for method in ("proposed", "coverage")] for name in ("views", "psnr")
         )
-        saved, difference = saved_share(*views), paired(*psnr)
+        saved, difference, where = saved_share(*views), paired(*psnr), where.capitalize()
         if saved is None or difference is None:
             missing = "episodes" if saved is None else "reconstructions"
-            lines.append(
-                f"{where.capitalize()}: cannot be said, `proposed` and `coverage` have no {missing} in common."
-            )
+            lines.append(f"{where}: cannot be said, `proposed` and `coverage` have no {missing} in common.")
             continue
-        taken = " against ".join(found.text("views") if (found := summary(values)) else NOTHING for values in views)
+        taken = " against ".join(map(_mean, views))
         lines.append(
-            f"{where.capitalize()} `proposed` takes {_percent(saved)} % fewer views than `coverage` "
-            f"({taken}); its PSNR differs by "
-            f"{difference.text('psnr', sign=True)} dB. At least {100 * FEWER_VIEWS:.0f} % fewer views at a "
+            f"{where} `proposed` takes {saved.text('coverage')} % fewer views than `coverage` ({taken}); its PSNR "
+            f"differs by {difference.text('psnr', sign=True)} dB. At least {100 * FEWER_VIEWS:.0f} % fewer views at a "
             f"PSNR no more than {WORSE_DB} dB lower: {_holds(saved, difference)}"
         )
     return lines
-
-
-def _percent(share: Summary) -> str:
-    return Summary(100 * share.mean, 100 * share.half_width, share.seeds).text("views")
 
 
 def _holds(saved: Summary, difference: Summary) -> str:
@@ -145,35 +142,34 @@ def _compared(results: Results, left: str, right: str, role: str) -> list[str]:
     if not common:
         return [f"{where}: `{left}` and `{right}` have no reconstructed episodes in common."]
     first, second = {key: first[key] for key in common}, {key: second[key] for key in common}
-    rows = [["views", f"{left} − {right} [dB]", "episodes"]]
-    for views in sorted({views for curve in (*first.values(), *second.values()) for views in curve}):
-        both = [{key: curve[views] for key, curve in curves.items() if views in curve} for curves in (first, second)]
-        # A number of views that only some episodes reach compares others than the rest of the table does.
-        if all(len(values) == len(common) for values in both):
-            rows.append([str(views), _difference(paired(*both), "psnr"), str(len(common))])
+    head, rows = ["views", f"{left} − {right} [dB]", "episodes"], []
+    # A number of views that only some episodes reach compares others than the rest of the table does.
+    for views in sorted(set.intersection(*(set(curve) for curve in (*first.values(), *second.values())))):
+        both = [{key: curve[views] for key, curve in curves.items()} for curves in (first, second)]
+        rows.append([str(views), _difference(paired(*both), "psnr"), str(len(common))])
     shorter = {key: min(max(first[key]), max(second[key])) for key in common}
-    both = [_at(curves, shorter) for curves in (first, second)]
+    both = [
+        {key: psnr for key, curve in curves.items() if (psnr := at_views(curve, shorter[key])) is not None}
+        for curves in (first, second)
+    ]
     difference = paired(*both)
-    shared = sum(key in both[1] for key in both[0])
-    rows.append(["the shorter episode's", _difference(difference, "psnr"), str(shared)])
+    rows.append(["the shorter episode's", _difference(difference, "psnr"), str(len(set.intersection(*map(set, both))))])
     said = _equal_views(difference) if difference else "no common range of views."
-    sentence = f"{where}, `{left}` against `{right}`: {said}"
-    return [sentence, aligned(rows), _equal_psnr(first, second, left, right), _equal_psnr(second, first, right, left)]
+    return [
+        f"{where}, `{left}` against `{right}`: {said}",
+        table(head, rows, words=1),
+        _equal_psnr(first, second, left, right),
+        _equal_psnr(second, first, right, left),
+    ]
 
 
 def _curves(results: Results, method: str, role: str) -> Curves:
     """Of the episodes that were also reconstructed as a whole: only those say what all their views gave."""
-    found = {
+    return {
         key: {views: one.scores["psnr"] for views, one in curve.items() if "psnr" in one.scores}
         for key, curve in results.reconstruction_curves(method, role).items()
         if any(one.whole and "psnr" in one.scores for one in curve.values())
     }
-    return {key: curve for key, curve in found.items() if curve}
-
-
-def _at(curves: Curves, views: Mapping[Key, int]) -> dict[Key, float]:
-    found = {key: at_views(curve, views[key]) for key, curve in curves.items()}
-    return {key: psnr for key, psnr in found.items() if psnr is not None}
 
 
 def _equal_views(difference: Summary) -> str:
@@ -199,18 +195,13 @@ def _equal_psnr(left: Curves, right: Curves, name: str, other: str) -> str:
         return f"{head} in none of {len(needed)} episodes: never reached."
     if len(reached) < len(needed):
         head += f" in {len(reached)} of {len(needed)} episodes (never reached in the others),"
-    spent, have = summary(reached), summary({key: taken[key] for key in reached})
-    fewer = paired({key: taken[key] for key in reached}, reached)
-    assert spent is not None
-    assert have is not None
-    assert fewer is not None
-    text = (
-        f"{head} after {spent.text('views')} views where `{other}` took {have.text('views')}: "
-        f"{fewer.text('views', sign=True)} views saved"
+    have = {key: taken[key] for key in reached}
+    least = sum(views == min(left[key]) for key, views in reached.items())
+    note = f" (in {least} already at the fewest views measured, so that it may need fewer still)" if least else ""
+    return (
+        f"{head} after {_mean(reached)} views where `{other}` took {_mean(have)}: "
+        f"{_difference(paired(have, reached), 'views')} views saved{note}."
     )
-    if least := sum(views == min(left[key]) for key, views in reached.items()):
-        text += f" (in {least} already at the fewest views measured, so that it may need fewer still)"
-    return text + "."
 
 
 def _prediction(results: Results) -> list[str]:
@@ -222,14 +213,14 @@ def _prediction(results: Results) -> list[str]:
         return ["Cannot be said: fewer than three reconstructions with a visibility and a PSNR, or all alike."]
     reached = f"at least {GOOD_RHO}" if overall.rho >= GOOD_RHO else f"below {GOOD_RHO}"
     also = f"; over whole episodes only {whole}" if whole else ""
-    rows = [["Spearman's ρ with PSNR", *PREDICTORS, "reconstructions", "rollouts"]]
+    head, rows = ["Spearman's ρ with PSNR", *PREDICTORS, "reconstructions", "rollouts"], []
     for where, one in seen.items():
         counts = [str(one.points), str(one.rollouts)] if one else [NOTHING, NOTHING]
         rows.append([where, *(str(found[name][where] or NOTHING) for name in PREDICTORS), *counts])
     return [
         f"Over all reconstructions visibility and PSNR have {overall}, {reached}{also}. In brackets: 95 % "
         "interval, bootstrap over rollouts.",
-        aligned(rows),
+        table(head, rows, words=1),
     ]
 
 
@@ -237,19 +228,19 @@ def _transfer(results: Results) -> list[str]:
     if not results.scenes(UNSEEN):
         return ["No unseen scene in this experiment."]
     names = ("views", "coverage", "psnr")
-    rows = [["unseen − train", *map(_heading, names)]]
+    head, rows = ["unseen − train", *map(_heading, names)], []
     for method in results.methods:
         # The scenes differ, so only seed and start pair them.
         both = [[_over_scenes(results.values(method, role, name)) for role in (UNSEEN, TRAIN)] for name in names]
         cells = [_difference(paired(*values), name) for values, name in zip(both, names, strict=True)]
         if set(cells) != {NOTHING}:
             rows.append([method, *cells])
-    if len(rows) == 1:
+    if not rows:
         return ["Nothing to compare: no method has episodes both in scenes of training and in unseen ones."]
     return [
         "Nothing was trained again. PSNR depends on the scene as well as on the views, so methods compare within a "
         "column, not with 0.",
-        aligned(rows),
+        table(head, rows, words=1),
     ]
 
 
@@ -269,3 +260,8 @@ def _heading(name: str) -> str:
 
 def _difference(found: Summary | None, name: str) -> str:
     return found.text(name, sign=True) if found else NOTHING
+
+
+def _mean(views: Mapping[Key, float]) -> str:
+    found = summary(views)
+    return found.text("views") if found else NOTHING

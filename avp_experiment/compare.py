@@ -13,7 +13,7 @@ from tyro.conf import arg
 from avp_experiment.cells import plan
 from avp_experiment.configuration import DEFAULT, METHODS, PRESETS, Configuration, chosen_methods, read_scenes
 from avp_experiment.folder import open_folder
-from avp_experiment.runner import PRELOAD, Runner, default_jobs, environment
+from avp_experiment.runner import PRELOAD, Runner, environment
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
 from avp_habitat.scenes.location import UP_HELP
@@ -142,7 +142,7 @@ def main(options: Compare) -> None:
     began = time.monotonic()
     configuration = options.configuration()
     out = Path("runs") / f"experiment-{options.preset}" if options.out == AUTO else Path(options.out)
-    jobs = _number("jobs", options.jobs, default_jobs())
+    jobs = _number("jobs", options.jobs, len(os.sched_getaffinity(0)))
     compare(configuration, out, jobs=jobs, line=options.line)
     print(f"done in {(time.monotonic() - began) / 60:.1f} min")
 

@@ -113,11 +113,6 @@ class Scene:
     role: str
     """`TRAIN` or `UNSEEN`."""
 
-    @property
-    def slug(self) -> str:
-        """The name for files."""
-        return scene_slug(self.name)
-
 
 def scene_slug(name: str) -> str:
     """A scene's name for files: `white_room.glb` becomes `white_room`, `builtin:0` becomes `builtin_0`."""
@@ -190,5 +185,5 @@ def _check_different(scene: Scene, other: Scene) -> None:
         raise UsageError(
             f"{scene.spec}: the same scene as {other.spec}, given as {other.role}; expected each scene once"
         )
-    if scene.slug == other.slug:
+    if scene_slug(scene.name) == scene_slug(other.name):
         raise UsageError(f"{scene.spec}: has the same name as {other.spec}; expected scenes of different names")

@@ -117,7 +117,8 @@ def open_folder(configuration: Configuration, root: Path) -> Folder:
         names = sorted({*wanted, *known} - {"starts"})
         if different := [name for name in names if wanted.get(name) != known.get(name)]:
             told = "; ".join(
-                f"{name} {_short(known.get(name))} there, {_short(wanted.get(name))} asked for" for name in different
+                f"{name} {str(known.get(name))[:60]} there, {str(wanted.get(name))[:60]} asked for"
+                for name in different
             )
             raise UsageError(
                 f"out: {root} holds an experiment of another configuration: {told}; name another folder, or remove it"
@@ -161,13 +162,6 @@ def _known(path: Path) -> dict[str, Any]:
     if (version := known.pop("format")) != FORMAT:
         raise AVPError(f"{path}: expected format {FORMAT}, found {version!r}")
     return known
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, list) and value and isinstance(value[0], dict):
-        return ", ".join(f"{one['name']} ({one['role']})" for one in value)
-    text = str(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _bytes_needed(cells: Sequence[Cell], configuration: Configuration) -> int:

@@ -9,7 +9,6 @@ import numpy as np
 from avp_experiment.configuration import TRAIN, UNSEEN, scene_slug
 from avp_experiment.plots import WIDTH_IN, Drawn, Missing, new_figure
 from avp_experiment.results import PICTURES, Episode, Results, floor_of
-from avp_habitat.errors import AVPError
 from avp_habitat.metrics import FIGURES
 from avp_habitat.poses import heading
 from avp_habitat.rollout.images import read_rgb
@@ -90,7 +89,7 @@ def same_views(results: Results, role: str) -> Drawn:
             psnr = f"{scores[name]:.1f} dB" if name in scores else f"view {number}" if name == "truth" else ""
             axes.set_title(head + psnr, fontsize=9)
             if name in named:
-                axes.imshow(_picture(named[name]), interpolation="nearest")
+                axes.imshow(read_rgb(named[name]), interpolation="nearest")
     left_out = [method for method in there if method not in columns]
     caption = (
         f"Held-out views {', '.join(map(str, found))} of {scene}: truth, and renders from the reconstructions of whole "
@@ -147,10 +146,3 @@ def _view_scores(results: Results, scene: str, number: int) -> dict[str, float]:
     whole = [one for one in results.reconstructions if one.whole and one.key == (scene, 0, 0)]
     found = {one.method: one.psnr_by_view[number] for one in whole if number < len(one.psnr_by_view)}
     return {method: psnr for method, psnr in found.items() if psnr is not None}
-
-
-def _picture(path: Path) -> np.ndarray:
-    try:
-        return read_rgb(path)
-    except (OSError, ValueError, SyntaxError) as error:
-        raise AVPError(f"{path}: expected a PNG, could not read it: {error}") from None

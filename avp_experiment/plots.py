@@ -1,7 +1,7 @@
 """The figures that are curves and points: training, PSNR by views, visibility; and how all figures look."""
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,9 +21,7 @@ CPV, REWARD = "avp/cpv", "rollout/ep_rew_mean"
 _MILLION = 1e6
 _ROLES = {TRAIN: "scene of training", UNSEEN: "unseen scene"}
 WIDTH_IN = 9.6
-"""Of a picture: 1150 pixels."""
-_DPI = 120
-_MOST_BYTES = 290_000
+_DPI = 100
 
 
 class Missing(Exception):
@@ -40,21 +38,10 @@ class Drawn:
     """What is plotted, of how many seeds and starts."""
 
     def save(self, path: Path) -> None:
-        """Write a PNG; one with photographs gets fewer colours, then fewer pixels, until it has a modest size."""
+        """Write a PNG of 256 colours, which keeps photographs small."""
         drawn = io.BytesIO()
         self.picture.savefig(drawn, dpi=_DPI, format="png")
-        content = drawn.getvalue()
-        image, scale = Image.open(drawn).convert("RGB"), 1.0
-        while len(content) > _MOST_BYTES and scale > 0.3:
-            size = (round(image.width * scale), round(image.height * scale))
-            smaller = image.resize(size, Image.Resampling.LANCZOS) if scale < 1 else image
-            written = io.BytesIO()
-            smaller.quantize(256, dither=Image.Dither.NONE).save(written, format="PNG", optimize=True)
-            content, scale = written.getvalue(), scale * 0.88
-        path.write_bytes(content)
-
-
-Maker = Callable[[Results], Drawn]
+        Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 @dataclass(frozen=True)
@@ -62,9 +49,7 @@ class Style:
     """Colour, marker and line of one method, the same in all pictures."""
 
     colour: str
-    """Of its lines and points."""
     marker: str
-    """Of its points."""
     line: str = "-"
     """Dashed where it was trained in generated rooms."""
     filled: bool = True
@@ -155,7 +140,7 @@ def psnr_by_views(results: Results) -> Drawn:
     return Drawn(
         picture,
         "PSNR of reconstructions from the first k frames of an episode; the last point of a line is the whole episode, "
-        f"at its mean number of views. Means over {_seeds(results)}, of the episodes that were also "
+        f"at its mean number of views. Means over {results.seeds}, of the episodes that were also "
         "reconstructed in part; bars: 95 % confidence interval over seeds (Student's t). A "
         "point is left out where some of these episodes ended before.",
     )
@@ -179,7 +164,7 @@ def visibility_and_psnr(results: Results) -> Drawn:
     whole = sum(point.whole for point in points)
     return Drawn(
         picture,
-        f"All {len(points)} reconstructions, of {_seeds(results)}: large points are the {whole} of whole "
+        f"All {len(points)} reconstructions, of {results.seeds}: large points are the {whole} of whole "
         f"episodes, small pale ones the {len(points) - whole} of first frames. Left: share of the held-out pixels that "
         "the frames have seen; right: share of the floor cells observed. ρ is Spearman's, with a 95 % interval "
         "(bootstrap over rollouts).",
@@ -279,8 +264,3 @@ def _correlation_title(points: Sequence[Point], name: str) -> str:
 def _legend(picture: "Figure", panels: Any) -> None:
     handles = {label: one for axes in panels for one, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     picture.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=6, fontsize=8)
-
-
-def _seeds(results: Results) -> str:
-    count = results.configuration.get("seeds", "?")
-    return f"{count} seed" if count == 1 else f"{count} seeds"

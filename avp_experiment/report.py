@@ -34,18 +34,6 @@ _SETTINGS = ("seeds", "starts", "budget", "observation", "steps", "steps_rooms",
              "iterations")  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Part:
-    """A piece of the page."""
-
-    title: str
-    """Its heading."""
-    text: str | None
-    """None where it could not be made."""
-    reason: str = ""
-    """Why not."""
-
-
 def write_report(folder: Path, *, shown_maps: Sequence[str] = DEFAULT_MAPS) -> Path:
     """Write tables, figures, claims and the page that holds them.
 
@@ -61,16 +49,29 @@ def write_report(folder: Path, *, shown_maps: Sequence[str] = DEFAULT_MAPS) -> P
         AVPError: the results are damaged, or the folder cannot be written.
     """
     results = read_results(folder)
+    parts: dict[str, Callable[[], str]] = {
+        title: partial(_table, results, name, role, title) for name, (role, title) in _TABLES.items()
+    }
+    parts |= {
+        title: partial(_figure, results, name, title, draw) for name, (title, draw) in _figures(shown_maps).items()
+    }
+    sections, left_out = [], []
     try:
+        for title, make in parts.items():
+            try:
+                sections.append(f"## {title}\n\n{make()}")
+            except Missing as reason:
+                left_out.append(f"- {title}: {reason}.")
         said = claims(results)
         (folder / CLAIMS).write_text(said, encoding="utf-8")
-        parts = [_table(results, name, role, title) for name, (role, title) in _TABLES.items()]
-        parts += [_figure(results, name, title, draw) for name, (title, draw) in _figures(shown_maps).items()]
-        page = folder / PAGE
-        page.write_text(_page(results, parts, said), encoding="utf-8")
+        reading = folder / READING
+        read = [_below(reading.read_text(encoding="utf-8"))] if reading.is_file() else []
+        end = "\n".join(["## Left out", "", *(left_out or ["Nothing."])])
+        text = "\n\n".join(["# Results of the experiment", _origin(results), *read, *sections, _below(said), end])
+        (folder / PAGE).write_text(f"{text}\n", encoding="utf-8")
     except OSError as error:
         raise AVPError(f"{folder}: cannot write there: {error.strerror or error}") from None
-    return page
+    return folder / PAGE
 
 
 def _figures(shown_maps: Sequence[str]) -> dict[str, tuple[str, Callable[[Results], Drawn]]]:
@@ -85,53 +86,35 @@ def _figures(shown_maps: Sequence[str]) -> dict[str, tuple[str, Callable[[Result
     }
 
 
-def _table(results: Results, name: str, role: str, title: str) -> _Part:
+def _table(results: Results, name: str, role: str, title: str) -> str:
     table = make_table(results, role)
-    paths = {suffix: results.folder / f"{name}.{suffix}" for suffix in ("md", "csv")}
+    paths = [results.folder / f"{name}.{suffix}" for suffix in ("md", "csv")]
     if table is None:
-        for path in paths.values():
+        for path in paths:
             path.unlink(missing_ok=True)
-        reason = "no episode there is done" if results.scenes(role) else "no such scene in this experiment"
-        return _Part(title, None, reason)
-    paths["md"].write_text(f"# {title}\n\n{table.markdown()}", encoding="utf-8")
-    paths["csv"].write_text(table.csv(), encoding="utf-8")
-    counts = sorted(set(table.episodes.values()))
+        raise Missing("no episode there is done" if results.scenes(role) else "no such scene in this experiment")
+    for path, text in zip(paths, (f"# {title}\n\n{table.markdown()}", table.csv()), strict=True):
+        path.write_text(text, encoding="utf-8")
+    counts = sorted(table.episodes.values())
     episodes = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
-    seeds = results.configuration.get("seeds", "?")
-    caption = (
-        f"{', '.join(results.scenes(role))}: mean ± 95 % confidence interval over {seeds} seed{'s' * (seeds != 1)} "
-        f"(Student's t), {episodes} episodes of each method. [CSV]({name}.csv)"
+    return (
+        f"{', '.join(results.scenes(role))}: mean ± 95 % confidence interval over {results.seeds} (Student's t), "
+        f"{episodes} episodes of each method. [CSV]({name}.csv)\n\n{table.markdown().rstrip()}"
     )
-    return _Part(title, f"{caption}\n\n{table.markdown().rstrip()}")
 
 
-def _figure(results: Results, name: str, title: str, draw: Callable[[Results], Drawn]) -> _Part:
+def _figure(results: Results, name: str, title: str, draw: Callable[[Results], Drawn]) -> str:
     path = results.folder / f"{name}.png"
-    try:
-        drawn = draw(results)
-    except Missing as reason:
-        # One of an earlier state of the results would stand beside figures of this one.
-        path.unlink(missing_ok=True)
-        return _Part(title, None, str(reason))
+    # One of an earlier state of the results would stand beside figures of this one.
+    path.unlink(missing_ok=True)
+    drawn = draw(results)
     drawn.save(path)
-    return _Part(title, f"![{title}]({path.name})\n\n{drawn.caption}")
-
-
-def _page(results: Results, parts: Sequence[_Part], said: str) -> str:
-    lines = ["# Results of the experiment", _origin(results)]
-    reading = results.folder / READING
-    if reading.is_file():
-        lines.append(_below(reading.read_text(encoding="utf-8").strip()))
-    lines += [f"## {part.title}\n\n{part.text}" for part in parts if part.text is not None]
-    lines.append(_below(said.strip()))
-    left_out = [f"- {part.title}: {part.reason}." for part in parts if part.text is None]
-    lines.append("\n".join(["## Left out", "", *(left_out or ["Nothing."])]))
-    return "\n\n".join(lines) + "\n"
+    return f"![{title}]({path.name})\n\n{drawn.caption}"
 
 
 def _below(text: str) -> str:
     """A page as a part of another: its headings one level deeper."""
-    return "\n".join(f"#{line}" if line.startswith("#") else line for line in text.splitlines())
+    return "\n".join(f"#{line}" if line.startswith("#") else line for line in text.strip().splitlines())
 
 
 def _origin(results: Results) -> str:

@@ -17,28 +17,35 @@ from numpy.typing import NDArray
 
 from avp_experiment.cells import COLLECT, RECONSTRUCT, Cell, floor_map
 from avp_experiment.cells import TRAIN as TRAINING
-from avp_experiment.configuration import TRAIN, UNSEEN, Configuration
+from avp_experiment.configuration import TRAIN, UNSEEN, Configuration, scene_slug
 from avp_experiment.folder import Folder, write_whole
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.provenance import PACKAGES, installed_versions
 
 FORMAT = 1
 FILE, PICTURES = "results.json", "pictures"
+PARTS = {"training": TRAINING, "rollouts": COLLECT, "reconstructions": RECONSTRUCT}
+"""Kinds of cells by their keys in the file."""
 Made = TypeVar("Made")
 Key = tuple[str, int, int]
 """Scene, seed and start: what two methods have in common."""
 
 
 @dataclass(frozen=True)
-class Episode:
-    """One rollout."""
+class _Measured:
+    """What rollouts and reconstructions have in common."""
 
     method: str
-    """Its name."""
     role: str
     """Of its scene: train or unseen."""
     key: Key
     """Scene, seed and start."""
+
+
+@dataclass(frozen=True)
+class Episode(_Measured):
+    """One rollout."""
+
     metrics: Mapping[str, float]
     """Figures of the whole episode; shares within [0, 1]."""
     coverage_curve: tuple[float, ...]
@@ -48,15 +55,9 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class Reconstruction:
+class Reconstruction(_Measured):
     """One reconstruction of an episode's first frames, or of all of them."""
 
-    method: str
-    """Its name."""
-    role: str
-    """Of its scene: train or unseen."""
-    key: Key
-    """Scene, seed and start."""
     frames: int
     """How many frames it was made of."""
     whole: bool
@@ -76,9 +77,7 @@ class Training:
     """One training."""
 
     method: str
-    """Its name."""
     seed: int
-    """Of the training."""
     curves: Mapping[str, NDArray[np.float64]]
     """`(n, 2)` steps and values by metric."""
 
@@ -88,25 +87,26 @@ class Results:
     """Everything that an experiment found."""
 
     folder: Path
-    """Where it is."""
     configuration: Mapping[str, Any]
-    """As written."""
     methods: tuple[str, ...]
     """In the order of the tables."""
     origin: Mapping[str, Any]
-    """Command, commits, machine, versions, as written."""
+    """Command, commits, machine, versions."""
     trainings: tuple[Training, ...]
-    """All that are done."""
     rollouts: tuple[Episode, ...]
-    """All that are done."""
     reconstructions: tuple[Reconstruction, ...]
-    """All that are done."""
     failed: tuple[Mapping[str, str], ...]
     """`cell`, `reason` and `log` (relative to the folder) of what was tried in vain."""
 
     def scenes(self, role: str) -> list[str]:
         """Names of the scenes of a role, in the experiment's order."""
         return [scene["name"] for scene in self.configuration["scenes"] if scene["role"] == role]
+
+    @property
+    def seeds(self) -> str:
+        """How many, in words."""
+        count = self.configuration.get("seeds", "?")
+        return f"{count} seed" if count == 1 else f"{count} seeds"
 
     def values(self, method: str, role: str, name: str) -> dict[Key, float]:
         """A figure of a method by episode, as far as it is known; a score of its whole reconstruction.
@@ -116,8 +116,9 @@ class Results:
             role: of the scenes: train or unseen.
             name: of the figure.
         """
-        scores = {one.key: one.scores for one in self.reconstructions if one.whole and _of(one, method, role)}
-        metrics = {one.key: one.metrics for one in self.rollouts if _of(one, method, role)}
+        of = (method, role)
+        scores = {one.key: one.scores for one in self.reconstructions if one.whole and (one.method, one.role) == of}
+        metrics = {one.key: one.metrics for one in self.rollouts if (one.method, one.role) == of}
         found = metrics if any(name in figures for figures in metrics.values()) else scores
         return {key: figures[name] for key, figures in found.items() if name in figures}
 
@@ -128,14 +129,10 @@ class Results:
         """
         found: dict[Key, dict[int, Reconstruction]] = {}
         for one in sorted(self.reconstructions, key=lambda one: (one.frames, one.whole)):
-            if _of(one, method, role):
+            if (one.method, one.role) == (method, role):
                 found.setdefault(one.key, {})[one.frames] = one
         several = {key: curve for key, curve in found.items() if len(curve) > 1}
         return several or found
-
-
-def _of(one: Episode | Reconstruction, method: str, role: str) -> bool:
-    return (one.method, one.role) == (method, role)
 
 
 def floor_of(entry: Mapping[str, Any]) -> NDArray[np.uint16]:
@@ -207,8 +204,8 @@ def _training(entry: Any) -> Training:
     return Training(entry["method"], int(entry["seed"]), curves)
 
 
-def _key(entry: Any) -> Key:
-    return str(entry["scene"]), int(entry["seed"]), int(entry["start"])
+def _measured(entry: Any) -> tuple[str, str, Key]:
+    return entry["method"], entry["role"], (str(entry["scene"]), int(entry["seed"]), int(entry["start"]))
 
 
 def _numbers(entry: Any) -> dict[str, float]:
@@ -217,16 +214,14 @@ def _numbers(entry: Any) -> dict[str, float]:
 
 
 def _episode(entry: Any) -> Episode:
-    metrics, curve = _numbers(entry["metrics"]), tuple(float(share) for share in entry["coverage_curve"])
-    return Episode(entry["method"], entry["role"], _key(entry), metrics, curve, entry.get("map"))
+    curve = tuple(float(share) for share in entry["coverage_curve"])
+    return Episode(*_measured(entry), _numbers(entry["metrics"]), curve, entry.get("map"))
 
 
 def _reconstruction(entry: Any) -> Reconstruction:
     seen = entry.get("visibility")
     return Reconstruction(
-        method=entry["method"],
-        role=entry["role"],
-        key=_key(entry),
+        *_measured(entry),
         # An episode that stopped before has no more frames than it has.
         frames=min(int(entry["frames"]), round(entry["views"])),
         whole=bool(entry["whole"]),
@@ -259,17 +254,7 @@ def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], 
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
             "hours": round(sum(record["seconds"] for _, record in done) / 3600, 2),
         },
-        "training": [_about(cell, record) | record["facts"] for cell, record in done if cell.kind == TRAINING],
-        "rollouts": [
-            _about(cell, record) | record["facts"] | {"map": _map(cell, folder)}
-            for cell, record in done
-            if cell.kind == COLLECT
-        ],
-        "reconstructions": [
-            _about(cell, record) | _scored(cell, record["facts"], folder)
-            for cell, record in done
-            if cell.kind == RECONSTRUCT
-        ],
+        **{part: [_entry(cell, folder) for cell, _ in done if cell.kind == kind] for part, kind in PARTS.items()},
         "failed": [
             {"cell": cell.key, "reason": reason, "log": str(folder.log(cell).relative_to(folder.root))}
             for cell in cells
@@ -296,15 +281,16 @@ def _machine() -> dict[str, Any]:
     }
 
 
-def _about(cell: Cell, record: dict[str, Any]) -> dict[str, Any]:
-    about = {"method": cell.method.name, "seed": cell.seed}
-    if cell.scene is not None:
-        about |= {"scene": cell.scene.name, "role": cell.scene.role, "start": cell.start}
-    return about | {"commit": record["commit"], "seconds": record["seconds"]}
-
-
-def _map(cell: Cell, folder: Folder) -> dict[str, Any] | None:
-    return floor_map(cell.output(folder.root)) if cell.seed == cell.start == 0 else None
+def _entry(cell: Cell, folder: Folder) -> dict[str, Any]:
+    record = folder.record(cell) or {}
+    entry = {"method": cell.method.name, "seed": cell.seed, "commit": record["commit"], "seconds": record["seconds"]}
+    if cell.scene is None:
+        return entry | record["facts"]
+    entry |= {"scene": cell.scene.name, "role": cell.scene.role, "start": cell.start}
+    if cell.kind == RECONSTRUCT:
+        return entry | _scored(cell, record["facts"], folder)
+    first = cell.seed == cell.start == 0
+    return entry | record["facts"] | {"map": floor_map(cell.output(folder.root)) if first else None}
 
 
 def _scored(cell: Cell, found: dict[str, Any], folder: Folder) -> dict[str, Any]:
@@ -335,4 +321,4 @@ def _copy_pictures(cell: Cell, root: Path) -> None:
         kind, _, number = path.stem.partition("_")
         shown = "truth" if kind == "truth" else cell.method.name
         (root / PICTURES).mkdir(exist_ok=True)
-        shutil.copyfile(path, root / PICTURES / f"{cell.scene.slug}-{shown}-{int(number):02d}.png")
+        shutil.copyfile(path, root / PICTURES / f"{scene_slug(cell.scene.name)}-{shown}-{int(number):02d}.png")

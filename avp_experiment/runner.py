@@ -12,7 +12,6 @@ import sys
 import threading
 import time
 import traceback
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -22,26 +21,16 @@ from typing import Any
 
 from tqdm import tqdm
 
-from avp_experiment.cells import COLLECT, RECONSTRUCT, TRAIN, Cell, facts_of
+from avp_experiment.cells import Cell, facts_of
 from avp_experiment.folder import Folder
 from avp_habitat import command
-from avp_habitat.command import progress
 from avp_habitat.errors import AVPError
 from avp_habitat.provenance import git_commit
 
 PRELOAD = ("avp_sb3", "avp_nerfstudio.method.preload", "avp_habitat.collect", "avp_experiment.runner")
 """Everything heavy that cells use; multiprocessing passes over what is not installed."""
-NO_FACTS = 3
-"""Exit code of a cell whose command succeeded, but whose result cannot be read."""
 _MLFLOW_OURS = ("MLFLOW_RUN_ID", "MLFLOW_EXPERIMENT_ID", "MLFLOW_EXPERIMENT_NAME")
-_GUESS_S = {TRAIN: 120.0, COLLECT: 10.0, RECONSTRUCT: 30.0}
-_POLL_S, _TERMINATION_S = 1.0, 30.0
-_BAR = "{desc}: {n_fmt}/{total_fmt} cells |{bar}| {elapsed}{postfix}"
-
-
-def default_jobs() -> int:
-    """One cell per core that this process may use."""
-    return len(os.sched_getaffinity(0))
+_TERMINATION_S = 30.0
 
 
 def environment(tracking_uri: str) -> dict[str, str]:
@@ -51,19 +40,11 @@ def environment(tracking_uri: str) -> dict[str, str]:
 
 
 @dataclass
-class _Running:
-    """A cell that is being done."""
-
-    cell: Cell
-    process: Any
-    began: float
-
-
-@dataclass
 class Runner:
     """The scheduler."""
 
     folder: Folder
+    """Of the experiment."""
     jobs: int
     """Cells at a time."""
     environment: dict[str, str]
@@ -72,8 +53,6 @@ class Runner:
     """Modules imported once, before any cell; with none each cell has a new process, as Habitat-Sim wants it."""
     failed: dict[str, str] = field(default_factory=dict)
     """Reasons by the cell's key."""
-    _seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-    """How long cells of each kind took."""
 
     def run(self, cells: Sequence[Cell]) -> None:
         """Do all cells that are not done; those that fail, and those that need them, are passed over.
@@ -81,57 +60,46 @@ class Runner:
         Args:
             cells: each after the one that it needs.
         """
-        for cell in cells:
-            if (record := self.folder.record(cell)) is not None:
-                self._seconds[cell.kind].append(record["seconds"])
-        waiting = [cell for cell in cells if not self.folder.is_done(cell)]
         # Libraries read these when they are loaded, which is in the process from which cells are forked: with two
         # threads each, two reconstructions on two cores were ten times slower.
         os.environ.update({name: self.environment[name] for name in ("OMP_NUM_THREADS", "PYTHONWARNINGS")})
-        context = multiprocessing.get_context("forkserver" if self.preload else "spawn")
+        context: Any = multiprocessing.get_context("forkserver" if self.preload else "spawn")
         if self.preload:
             context.set_forkserver_preload(list(self.preload))
-        running: list[_Running] = []
+        waiting = [cell for cell in cells if not self.folder.is_done(cell)]
+        running: dict[Any, Cell] = {}
         done = len(cells) - len(waiting)
-        options = {"total": len(cells), "initial": done, "desc": "experiment", "unit": "cell", "bar_format": _BAR}
-        with progress(miniters=0, **options) as bar:
+        with command.progress(total=len(cells), initial=done, desc="experiment", unit="cell") as bar:
             try:
                 while waiting or running:
                     self._start(context, waiting, running)
-                    bar.set_postfix_str(self._state(waiting, running), refresh=sys.stderr.isatty())
-                    bar.update(self._collect(running))
-                    bar.update(self._pass_over(waiting))
+                    bar.set_postfix_str(", ".join(cell.key for cell in running.values()))
+                    wait([process.sentinel for process in running], timeout=1)
+                    bar.update(self._collect(running) + self._pass_over(waiting))
             except BaseException:
-                _stop(running)
+                _stop(list(running))
                 raise
 
-    def _start(self, context: Any, waiting: list[Cell], running: list[_Running]) -> None:
-        for cell in list(waiting):
+    def _start(self, context: Any, waiting: list[Cell], running: dict[Any, Cell]) -> None:
+        for cell in [cell for cell in waiting if cell.needs is None or self.folder.is_done(cell.needs)]:
             if len(running) >= self.jobs:
                 return
-            if cell.needs is not None and not self.folder.is_done(cell.needs):
-                continue
             waiting.remove(cell)
             arguments = (cell, self.folder.prepare(cell), self.folder.root, self.environment)
             process = context.Process(target=execute, args=arguments, name=cell.key)
             process.start()
-            running.append(_Running(cell, process, time.monotonic()))
+            running[process] = cell
 
-    def _collect(self, running: list[_Running]) -> int:
-        """Wait a moment; how many cells have ended."""
-        wait([one.process.sentinel for one in running], timeout=_POLL_S)
-        ended = [one for one in running if one.process.exitcode is not None]
-        for one in ended:
-            running.remove(one)
-            code = one.process.exitcode
-            if code == 0 and self.folder.record(one.cell) is not None:
-                self._seconds[one.cell.kind].append(time.monotonic() - one.began)
-            else:
+    def _collect(self, running: dict[Any, Cell]) -> int:
+        """Judge the cells that have ended; how many."""
+        ended = [process for process in running if process.exitcode is not None]
+        for process in ended:
+            cell, code = running.pop(process), process.exitcode
+            if code or self.folder.record(cell) is None:
                 ending = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
-                reason = f"{ending}: {_last_lines(self.folder.log(one.cell))}"
-                self.failed[one.cell.key] = reason
-                self.folder.fail(one.cell, reason)
-                tqdm.write(f"failed: {one.cell.key}: {reason}", file=sys.stderr)
+                self.failed[cell.key] = reason = f"{ending}: {_last_lines(self.folder.log(cell))}"
+                self.folder.fail(cell, reason)
+                tqdm.write(f"failed: {cell.key}: {reason}", file=sys.stderr)
         return len(ended)
 
     def _pass_over(self, waiting: list[Cell]) -> int:
@@ -143,44 +111,27 @@ class Runner:
             waiting.remove(cell)
         return len(dropped)
 
-    def _state(self, waiting: list[Cell], running: list[_Running]) -> str:
-        left = sum(self._expected(cell) for cell in waiting)
-        now = time.monotonic()
-        left += sum(max(self._expected(one.cell) - (now - one.began), 0) for one in running)
-        failures = f", {len(self.failed)} failed" if self.failed else ""
-        return f"about {_span(left / self.jobs)} left{failures}; now {', '.join(one.cell.key for one in running)}"
 
-    def _expected(self, cell: Cell) -> float:
-        known = self._seconds[cell.kind]
-        return sum(known) / len(known) if known else _GUESS_S[cell.kind]
-
-
-def _stop(running: Sequence[_Running]) -> None:
-    """End what is running, as Ctrl-C would; what does not end in time is killed."""
-    for one in running:
-        one.process.terminate()
+def _stop(running: Sequence[Any]) -> None:
+    """End processes as Ctrl-C would; what does not end in time is killed."""
+    for process in running:
+        process.terminate()
     until = time.monotonic() + _TERMINATION_S
-    for one in running:
-        one.process.join(max(until - time.monotonic(), 0))
-        if one.process.exitcode is None:
-            one.process.kill()
+    for process in running:
+        process.join(max(until - time.monotonic(), 0))
+        if process.exitcode is None:
+            process.kill()
 
 
-def _span(seconds: float) -> str:
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
-def _last_lines(log: Path, lines: int = 3) -> str:
-    """The error that a log ends with, else its last lines that say something, as one."""
+def _last_lines(log: Path) -> str:
+    """The error that a log ends with, else its last three lines that say something, as one."""
     try:
         text = log.read_text(encoding="utf-8", errors="replace")
     except OSError:
         return "no log"
     said = [line.strip() for line in text.replace("\r", "\n").splitlines() if line.strip()]
     errors = [line for line in said if line.startswith("error: ")]
-    return errors[-1].removeprefix("error: ") if errors else " | ".join(said[-lines:])[-400:]
+    return errors[-1].removeprefix("error: ") if errors else " | ".join(said[-3:])[-400:]
 
 
 def execute(cell: Cell, words: Sequence[str], root: Path, variables: dict[str, str]) -> None:
@@ -211,7 +162,6 @@ def execute(cell: Cell, words: Sequence[str], root: Path, variables: dict[str, s
 def _run(words: Sequence[str]) -> int:
     """The exit code of a command line; its program runs in this process."""
     try:
-        sys.argv = list(words[2:])
         return command.run(importlib.import_module(words[2]).main, words[3:])
     except SystemExit as end:
         if isinstance(end.code, str):
@@ -229,7 +179,7 @@ def _finish(folder: Folder, cell: Cell, seconds: float) -> int:
         folder.finish(cell, {**about, "facts": facts_of(cell, folder.root)})
     except (AVPError, OSError, ValueError, KeyError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return NO_FACTS
+        return 1
     return 0
 
 

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from avp_experiment.configuration import ROOMS, TRAIN
 from avp_experiment.results import Key, Results
 from avp_experiment.statistics import Summary, figure_named, summary
 from avp_habitat.metrics import FIGURES, Figure
+from avp_habitat.tables import table
 
 SCORES = ("psnr", "ssim", "lpips")
 COLUMNS = ("views", "coverage", "annd_m", "ei", "path_length_m", "visibility", *SCORES)
@@ -33,10 +34,12 @@ class Table:
 
     def markdown(self) -> str:
         """With mean ± half the 95 % confidence interval over seeds, and the notes below."""
-        rows = [["method", *(column.heading for column in self.columns)]]
-        rows += [[method, *(_cell(found[column.name], column) for column in self.columns)]
-                 for method, found in self.rows.items()]  # fmt: skip
-        return "\n".join([aligned(rows), *(f"\n{note}" for note in self.notes)]) + "\n"
+        head = ["method", *(column.heading for column in self.columns)]
+        rows = [
+            [method, *(found.text(name) if found else NOTHING for name, found in cells.items())]
+            for method, cells in self.rows.items()
+        ]
+        return "\n".join([table(head, rows, words=1), *(f"\n{note}" for note in self.notes)]) + "\n"
 
     def csv(self) -> str:
         """The same in the same units, mean and half width in columns of their own, with more digits."""
@@ -79,21 +82,6 @@ def make_table(results: Results, role: str) -> Table | None:
             *_notes(results, role, found),
         ),
     )
-
-
-def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table; the first row is its head, the first column stands left, all others right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    padded = [
-        [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
-        for row in rows
-    ]
-    padded.insert(1, ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])])
-    return "\n".join(f"| {' | '.join(row)} |" for row in padded)
-
-
-def _cell(found: Summary | None, figure: Figure) -> str:
-    return found.text(figure.name) if found else NOTHING
 
 
 def _numbers(found: Summary | None, figure: Figure) -> list[str]:
