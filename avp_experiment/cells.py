@@ -15,13 +15,14 @@ import numpy as np
 from avp_experiment.configuration import TRAIN as TRAIN_SCENE
 from avp_experiment.configuration import Configuration, Method, Scene, scene_slug
 from avp_habitat.errors import AVPError
+from avp_habitat.task.rewards import find_reward, needs_surface
 
 TRAIN, COLLECT, RECONSTRUCT = "train", "collect", "reconstruct"
 _MADE = {TRAIN: "model.zip", COLLECT: "rollout", RECONSTRUCT: "reconstruction"}
 _START_SEEDS = 1000
 """Seed of the first start of seed 0, and from one start of a seed to its next: more starts leave those before them."""
 _SURFACE_OBSERVATION = {"map": "surface_map"}
-"""What a policy that learns from surfaces observes instead."""
+"""What a policy whose reward needs the surface observes instead."""
 _CURVES = ("avp/cpv", "avp/coverage", "avp/views", "rollout/ep_rew_mean")
 """Metrics of a training whose course is kept, as at most `_POINTS` points."""
 _POINTS = 400
@@ -103,7 +104,7 @@ class _Planner:
     def training(self, method: Method, seed: int) -> Cell:
         configuration, preset = self.configuration, self.configuration.preset
         observation = preset.observation
-        if method.reward == "surface":
+        if needs_surface(find_reward(method.reward)):
             observation = _SURFACE_OBSERVATION.get(observation, observation)
         scenes = [scene.spec for scene in configuration.scenes if scene.role == TRAIN_SCENE]
         name = f"{method.name}-{seed}"
@@ -117,7 +118,7 @@ class _Planner:
     def rollout(self, method: Method, seed: int, scene: Scene, start: int, training: Cell | None) -> Cell:
         preset, (width, height) = self.configuration.preset, self.configuration.preset.size
         policy = (
-            ["--policy", str(training.output(self.root)), "--stochastic"] if training else ["--policy", method.name]
+            ["--policy", str(training.output(self.root)), "--stochastic"] if training else ["--policy", method.spec]
         )
         name = f"{method.name}-{scene_slug(scene.name)}-{seed}-{start}"
         words = ["python", "-m", "avp_habitat.collect", "--scene", scene.spec, *policy, "--reward", method.reward]

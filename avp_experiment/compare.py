@@ -11,17 +11,17 @@ from typing import Annotated
 from tyro.conf import arg
 
 from avp_experiment.cells import plan
-from avp_experiment.configuration import DEFAULT, METHODS, PRESETS, Configuration, chosen_methods, read_scenes
+from avp_experiment.configuration import DEFAULT, PRESETS, ROOMS, Configuration, chosen_methods, read_scenes
 from avp_experiment.folder import open_folder
 from avp_experiment.runner import PRELOAD, Runner, environment
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
 from avp_habitat.scenes.location import UP_HELP
-from avp_habitat.simulators.registry import ONE_PER_PROCESS, SIMULATOR_NAMES, SimulatorChoice
+from avp_habitat.simulators.registry import SIMULATORS, SimulatorChoice
 
 AUTO = "auto"
 NONE = "none"
-_METHODS = f"with commas between, of {', '.join(METHODS)}; auto: {', '.join(DEFAULT)}"
+_METHODS = f"with commas between: policies, rewards, and rewards with {ROOMS}; auto: {', '.join(DEFAULT)}"
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Compare:
     methods: Annotated[str, arg(help=f"with commas between, of {', '.join(METHODS)}; auto: {', '.join(DEFAULT)}")] = (
         AUTO
     )
-    simulator: Annotated[str, arg(help=", ".join(SIMULATOR_NAMES))] = "raycast"
+    simulator: Annotated[str, arg(help=f"{', '.join(SIMULATORS)} or MODULE:FACTORY")] = "raycast"
     up: Annotated[str | None, arg(help=UP_HELP)] = None
     out: str = AUTO
     """The experiment's folder, also of one to go on with; auto: runs/experiment-PRESET."""
@@ -115,7 +115,7 @@ def compare(configuration: Configuration, out: Path, *, jobs: int, line: str) ->
         status = "FAILED"
         try:
             cells = plan(configuration, out, tracking=parent.experiment)
-            preload = () if configuration.simulator in ONE_PER_PROCESS else PRELOAD
+            preload = () if SimulatorChoice(configuration.simulator).one_per_process else PRELOAD
             runner = Runner(folder, jobs, environment(tracking_uri()), preload)
             runner.run(cells)
             results = gather(configuration, folder, cells, command=line)

@@ -1,14 +1,15 @@
 """What an experiment consists of: methods, scenes, and a preset for each kind of machine and purpose."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from avp_habitat import plugins
 from avp_habitat.errors import UsageError, unknown_name
-from avp_habitat.policies.registry import POLICY_NAMES
+from avp_habitat.policies.registry import POLICIES
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
-from avp_habitat.task.rewards import REWARD_NAMES
+from avp_habitat.task.rewards import REWARDS
 
 TRAIN, UNSEEN = "train", "unseen"
 """Roles of scenes: policies are trained in the former, never in the latter."""
@@ -19,44 +20,65 @@ _FIRST_ROOM = 100
 
 @dataclass(frozen=True)
 class Method:
-    """A way to take views."""
+    """A way to take views: a policy, or what a policy learns from a reward."""
 
-    name: str
-    """In files and tables."""
-    reward: str = "coverage"
-    """What it learns from; of a baseline, which has no use for it, one without a stop."""
+    spec: str
+    """The policy or reward: its name or `module:object`."""
     learned: bool = False
-    """Whether it is trained."""
+    """Whether it is a reward."""
+    in_rooms: bool = False
+    """Whether it is trained in generated rooms, never in the scenes of the experiment."""
 
     @property
-    def in_rooms(self) -> bool:
-        """Whether it is trained in generated rooms."""
-        return self.learned and self.name.endswith(ROOMS)
+    def name(self) -> str:
+        """In files and tables."""
+        return self.spec.replace(":", ".") + (ROOMS if self.in_rooms else "")
+
+    @property
+    def reward(self) -> str:
+        """What it learns from; of a baseline, which has no use for it, one without a stop."""
+        return self.spec if self.learned else "coverage"
 
 
-METHODS = {name: Method(name) for name in POLICY_NAMES} | {
-    reward + suffix: Method(reward + suffix, reward, learned=True) for suffix in ("", ROOMS) for reward in REWARD_NAMES
-}
-"""By name: baselines, rewards, rewards trained in rooms."""
+def known_methods() -> dict[str, Method]:
+    """By name: policies, rewards, rewards trained in rooms; also those that other distributions register."""
+    rewards = plugins.names("avp.rewards", REWARDS)
+    methods = [Method(name) for name in plugins.names("avp.policies", POLICIES)]
+    methods += [Method(reward, learned=True, in_rooms=rooms) for rooms in (False, True) for reward in rewards]
+    return {method.name: method for method in methods}
+
+
 BASELINES = ("heuristic", "random", "frontier", "greedy", "oracle", "survey")
 """What learned policies are compared with by default; the last two plan with full knowledge, for floor and for all
 surfaces."""
-DEFAULT = (*BASELINES, *REWARD_NAMES, f"proposed{ROOMS}", f"surface{ROOMS}")
+DEFAULT = (*BASELINES, *REWARDS, f"proposed{ROOMS}", f"surface{ROOMS}")
 """The baselines, every reward, and the rewards with a learned stop trained over many rooms."""
 
 
-def chosen_methods(names: Iterable[str]) -> tuple[Method, ...]:
-    """The methods of these names, each once, in the order of `METHODS`.
+def chosen_methods(names: Sequence[str]) -> tuple[Method, ...]:
+    """The methods of these names, each once: known ones in their order, then those of the form `module:object`.
+
+    Args:
+        names: known ones, or `module:object` of a class or object with `predict`, or else of a reward; a reward's may
+            end in `_rooms`.
 
     Raises:
         UsageError: no such method, with the nearest name, or none at all.
     """
-    wanted = set(names)
-    if not wanted:
+    if not names:
         raise UsageError("methods: expected at least one, got none")
-    for name in wanted - set(METHODS):
-        raise unknown_name("method", name, METHODS)
-    return tuple(method for name, method in METHODS.items() if name in wanted)
+    known = known_methods()
+    for name in names:
+        if ":" not in name and name not in known:
+            raise unknown_name("method", name, known)
+    placed = [_placed(name) for name in dict.fromkeys(names) if ":" in name]
+    return (*(method for name, method in known.items() if name in names), *placed)
+
+
+def _placed(name: str) -> Method:
+    spec = name.removesuffix(ROOMS)
+    learned = not hasattr(plugins.find("avp.policies", spec, POLICIES), "predict")
+    return Method(spec, learned, in_rooms=learned and name != spec)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,8 @@
 import os
 import sys
 import weakref
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn, SupportsFloat
 
@@ -14,8 +15,8 @@ from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout.capture import VIEWS, capture_heldout, capture_step, publish_rollout
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.task.env import AVPEnv
-from avp_habitat.task.observations import action_space, observation_space
-from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
+from avp_habitat.task.observations import action_space, make_observation
+from avp_habitat.task.settings import TaskSettings
 
 _WORKERS = "stable_baselines3.common.vec_env.subproc_vec_env"
 
@@ -46,8 +47,9 @@ class UnopenedEnv(gymnasium.Env):
         """Name of the error's class, and its text."""
         self.render_mode = options.get("render_mode")
         settings = options.get("settings") or TaskSettings()
-        kind = options.get("observation", settings.observation)
-        self.observation_space = observation_space(kind if kind in OBSERVATION_NAMES else OBSERVATION_NAMES[0])
+        with suppress(AVPError):
+            settings = replace(settings, observation=options.get("observation", settings.observation))
+        self.observation_space = make_observation(settings).space
         self.action_space = action_space()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> NoReturn:

@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from avp_habitat import command
-from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.errors import UsageError
 from avp_habitat.files import check_writable
 from avp_habitat.policies.registry import TRUSTED, load_model
 from avp_habitat.policies.saved_model import is_normalised, load_statistics, statistics_of
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.simulators.registry import ONE_PER_PROCESS, SimulatorChoice, add_simulator_options, simulator_choice
-from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
-from avp_sb3.presets import PRESETS, Preset
+from avp_habitat.simulators.registry import SimulatorChoice, add_simulator_options, simulator_choice
+from avp_habitat.task.settings import TaskSettings
+from avp_sb3.presets import MAP, PRESETS, Preset
 
 _MLFLOW = "runs:/"
 _STATISTICS = "_vecnormalize.pkl"
@@ -58,13 +58,12 @@ def _parser() -> argparse.ArgumentParser:
 
 def _preset(options: argparse.Namespace) -> Preset:
     """PPO's settings; the buffer is shared by as many agents as asked for."""
-    if options.observation not in OBSERVATION_NAMES:
-        raise unknown_name("observation", options.observation, OBSERVATION_NAMES)
+    TaskSettings(observation=options.observation)
     if options.steps < 1:
         raise UsageError(f"--steps: expected at least 1, got {options.steps}")
     if options.eval_every < 1:
         raise UsageError(f"--eval-every: expected at least 1, got {options.eval_every}")
-    preset = PRESETS[options.observation]
+    preset = PRESETS.get(options.observation, MAP)
     buffer = preset.n_envs * preset.n_steps
     agents = preset.n_envs if options.agents is None else options.agents
     if agents < 1 or buffer % agents:
@@ -81,22 +80,24 @@ def _environment(options: argparse.Namespace, preset: Preset, choice: SimulatorC
     settings = TaskSettings(
         reward=options.reward,
         observation=options.observation,
-        lookup=not options.rays and choice.simulator == "raycast",
+        lookup=not options.rays and choice.single_rays,
         width=options.width,
         height=options.height,
     )
     common = {"agents": preset.n_envs, "settings": settings, "seed": options.seed}
     common |= {"simulator": choice.simulator, "gpu": choice.gpu, "navmesh": choice.navmesh, "up": choice.up}
-    if options.workers is None and (len(options.scene) == 1 or choice.simulator not in ONE_PER_PROCESS):
+    if options.workers is None and (len(options.scene) == 1 or not choice.one_per_process):
         return VecMonitor(AVPVecEnv(options.scene, **common))
     return VecMonitor(AVPSubprocVecEnv(options.scene, workers=options.workers, **common))
 
 
 def _model(options: argparse.Namespace, preset: Preset, env: Any) -> Any:
     if options.resume is None:
+        from gymnasium import spaces
         from stable_baselines3 import PPO
 
-        return PPO("MlpPolicy", env, device="cpu", seed=options.seed, **preset.arguments())
+        policy = "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy"
+        return PPO(policy, env, device="cpu", seed=options.seed, **preset.arguments())
     with tempfile.TemporaryDirectory() as folder:
         path = _resumed_file(options.resume, folder)
         try:

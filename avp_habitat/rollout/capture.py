@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from avp_habitat import poses
 from avp_habitat.errors import SceneError
 from avp_habitat.navigation.area import NavigableArea
+from avp_habitat.plugins import name_of
 from avp_habitat.poses import Intrinsics
 from avp_habitat.provenance import installed_versions
 from avp_habitat.rollout.drawing import draw_trajectory
@@ -186,7 +187,7 @@ def _scene_and_task(env: AVPEnv, heldout: int) -> dict[str, Any]:
     return {
         "scene": {"name": env.scene_name, "sha256": env.scene_digest, **asdict(env.simulator.scene_frame)},
         "simulator": {"name": env.simulator.name, "version": env.simulator.version},
-        "reward": settings.reward,
+        "reward": name_of(settings.reward),
         "reward_constants": asdict(settings.constants),
         "budget": settings.budget,
         "actions": {

@@ -56,7 +56,7 @@ class RaycastSimulator:
 
     @cached_property
     def _area(self) -> "NavigableArea":
-        from avp_habitat.navigation.area import build_area
+        from avp_habitat.navigation.build import build_area
         from avp_habitat.navigation.settings import NavigationSettings
         from avp_habitat.scenes.masks import without_holes
 

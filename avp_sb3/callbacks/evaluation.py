@@ -178,7 +178,7 @@ class EvaluationCallback(BaseCallback):
                     "settings, or an eval_env of its own kind"
                 )
             # Only rays can be looked up.
-            settings = replace(settings, lookup=settings.lookup and self._choice.simulator == "raycast")
+            settings = replace(settings, lookup=settings.lookup and self._choice.single_rays)
         return fixed_starts(self._scenes, self._choice, episodes=self._episodes, settings=settings)
 
     def _evaluate(self) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.vec_env import VecEnv
 
-from avp_habitat.simulators.registry import ONE_PER_PROCESS, SimulatorChoice
+from avp_habitat.simulators.registry import SimulatorChoice
 from avp_habitat.task.settings import TaskSettings
 from avp_sb3.vec_env.batched import AVPVecEnv
 from avp_sb3.vec_env.subproc import AVPSubprocVecEnv
@@ -77,7 +77,7 @@ def fixed_starts(scenes: Sequence[str], choice: SimulatorChoice, *, episodes: in
         AVPError: as `AVPVecEnv` and `AVPSubprocVecEnv`.
     """
     options = {"simulator": choice.simulator, "gpu": choice.gpu, "navmesh": choice.navmesh, "up": choice.up}
-    if choice.simulator not in ONE_PER_PROCESS:
+    if not choice.one_per_process:
         return FixedStarts(scenes, episodes=episodes, settings=settings, **options)
     return FixedStartsInProcesses(list(scenes), agents=episodes * len(scenes), settings=settings, **options)
 

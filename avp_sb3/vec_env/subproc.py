@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from avp_habitat.errors import AVPError, SimulatorError, UsageError
 from avp_habitat.simulators.registry import SimulatorChoice
-from avp_habitat.task.observations import action_space, observation_space
+from avp_habitat.task.observations import Observed, action_space, each, make_observation
 from avp_habitat.task.settings import TaskSettings
 from avp_sb3.vec_env.batched import scenes_given
 from avp_sb3.vec_env.processes import Failure, Order, end_processes, named_deaths, serve
@@ -160,7 +160,7 @@ class AVPSubprocVecEnv(VecEnv):
             agents: n, at least one for each worker; one for each when omitted.
             workers: processes, a multiple of the number of scenes; one for each scene when omitted. Agent i is of
                 worker i modulo their number.
-            simulator: `raycast` or `habitat`.
+            simulator: its name, `module:factory`, or the factory itself.
             gpu: the CUDA device of `habitat`, or several, of which worker i takes number i modulo their number; -1
                 for none, None for the first one there is.
             navmesh: file of the only scene's NavMesh; computed when omitted.
@@ -184,7 +184,7 @@ class AVPSubprocVecEnv(VecEnv):
         agents = self._count if agents is None else agents
         if agents < self._count:
             raise UsageError(f"agents: expected at least {self._count}, one for each worker, got {agents}")
-        self.settings = settings or TaskSettings(lookup=simulator == "raycast")
+        self.settings = settings or TaskSettings(lookup=choices[0].single_rays)
         orders = [
             Order(
                 self.scenes[worker % len(self.scenes)],
@@ -195,9 +195,10 @@ class AVPSubprocVecEnv(VecEnv):
             for worker in range(self._count)
         ]
         self._known: dict[tuple[str, int], Any] = {}
+        space = make_observation(self.settings).space
         self._workers = Workers(orders, start_method=start_method)
         self.render_mode = None
-        super().__init__(agents, observation_space(self.settings.observation), action_space())
+        super().__init__(agents, space, action_space())
         self.seed(seed)
 
     @property
@@ -205,22 +206,22 @@ class AVPSubprocVecEnv(VecEnv):
         """The workers' processes (`multiprocessing.Process`), in order."""
         return list(self._workers.processes)
 
-    def reset(self) -> NDArray[np.float32]:  # type: ignore[override]
-        """Start all episodes at random; `(n, 12)`, longer with a map."""
+    def reset(self) -> Observed:  # type: ignore[override]
+        """Start all episodes at random; the first axis of what is observed is n."""
         count = self._count
         with _ended_by_errors(self):
             answers = self._workers.ask({worker: (self._seeds[worker::count],) for worker in range(count)}, "reset")
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{"coverage": 0.0, "views": 0} for _ in range(self.num_envs)]
-        return self._joined(answers[worker] for worker in range(count))
+        return each(self._joined, *(answers[worker] for worker in range(count)))
 
     def step_async(self, actions: NDArray[np.integer]) -> None:
         """Send the `(n,)` actions to the workers."""
         actions = np.asarray(actions)
         self._workers.send({worker: (actions[worker :: self._count],) for worker in range(self._count)}, "step")
 
-    def step_wait(self) -> tuple[NDArray, NDArray, NDArray, list[dict[str, Any]]]:  # type: ignore[override]
+    def step_wait(self) -> tuple[Observed, NDArray, NDArray, list[dict[str, Any]]]:  # type: ignore[override]
         """What all agents saw; those whose episode ended start the next one, as SB3 expects."""
         with _ended_by_errors(self):
             answers = self._workers.receive(range(self._count))
@@ -228,7 +229,7 @@ class AVPSubprocVecEnv(VecEnv):
         infos: list[dict[str, Any]] = [{}] * self.num_envs
         for worker, own in enumerate(columns[3]):
             infos[worker :: self._count] = own
-        observation, reward, done = (self._joined(column) for column in columns[:3])
+        observation, reward, done = (each(self._joined, *column) for column in columns[:3])
         return observation, reward, done, infos
 
     def close(self) -> None:
@@ -279,8 +280,7 @@ class AVPSubprocVecEnv(VecEnv):
             self._known[name, worker] = self._of_agents([worker], "get_attr", name)[0]
         return self._known[name, worker]
 
-    def _joined(self, parts: Iterable[NDArray]) -> NDArray:
-        arrays = list(parts)
+    def _joined(self, *arrays: NDArray) -> NDArray:
         joined = np.empty((self.num_envs, *arrays[0].shape[1:]), arrays[0].dtype)
         for worker, array in enumerate(arrays):
             joined[worker :: self._count] = array

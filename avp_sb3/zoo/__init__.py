@@ -10,8 +10,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
 from avp_habitat.errors import UsageError
-from avp_habitat.simulators.base import Simulator
-from avp_habitat.simulators.registry import ONE_PER_PROCESS, SimulatorChoice, open_simulator
+from avp_habitat.simulators.base import Simulator, SingleRays
+from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.settings import TaskSettings
 from avp_sb3.vec_env.batched import AVPVecEnv
@@ -19,7 +19,6 @@ from avp_sb3.zoo.processes import WatchedProcesses
 
 _REPLACED = (Monitor, OrderEnforcing, PassiveEnvChecker)
 """Wrappers whose work the batch does itself, or does not need."""
-_WITH_LOOKUP = "raycast"
 _HOOK = "avp_sb3.zoo.Batched"
 
 
@@ -98,7 +97,7 @@ def _settings(envs: list[AVPEnv], *, lookup: bool) -> TaskSettings:
                     f"{_HOOK}: expected the same settings in every environment, found {field.name} {first!r} in "
                     f"number 0 and {other!r} in number {index}"
                 )
-    rays = all(env.simulator.name == _WITH_LOOKUP for env in envs)
+    rays = all(isinstance(env.simulator, SingleRays) for env in envs)
     return replace(settings, lookup=lookup and rays)
 
 
@@ -112,9 +111,9 @@ def _simulators(envs: list[AVPEnv], scenes: Sequence[str | Path]) -> list[Simula
             f"set n_envs:{len(scenes)} and n_steps so that their product is PPO's buffer"
         )
     choice = envs[0].choice or SimulatorChoice(own[0].name)
-    if choice.simulator in ONE_PER_PROCESS and len(scenes) > 1:
+    if choice.one_per_process and len(scenes) > 1:
         raise UsageError(
-            f"{_HOOK}: scenes: a process can hold one simulator of {choice.simulator!r}, got {len(scenes)} scenes; add "
+            f"{_HOOK}: scenes: a process can hold one simulator of {choice.name!r}, got {len(scenes)} scenes; add "
             f"--vec-env subproc and set n_envs:{len(scenes)}, with n_steps so that their product is PPO's buffer"
         )
     return [open_simulator(choice, scene) for scene in scenes]
