@@ -21,6 +21,7 @@ from avp_habitat.simulators.registry import SIMULATORS, SimulatorChoice
 
 AUTO = "auto"
 NONE = "none"
+_METHODS = f"with commas between: policies, rewards, rewards with {ROOMS}, module:object; auto: {', '.join(DEFAULT)}"
 _METHODS = f"with commas between: policies, rewards, and rewards with {ROOMS}; auto: {', '.join(DEFAULT)}"
 
 
@@ -40,9 +41,7 @@ class Compare:
     """Trainings of each reward; auto: the preset's number."""
     starts: str = AUTO
     """Episodes of each method, scene and seed; auto: the preset's number."""
-    methods: Annotated[str, arg(help=f"with commas between, of {', '.join(METHODS)}; auto: {', '.join(DEFAULT)}")] = (
-        AUTO
-    )
+    methods: Annotated[str, arg(help=_METHODS)] = AUTO
     simulator: Annotated[str, arg(help=f"{', '.join(SIMULATORS)} or MODULE:FACTORY")] = "raycast"
     up: Annotated[str | None, arg(help=UP_HELP)] = None
     out: str = AUTO

@@ -8,7 +8,7 @@ import pytest
 
 from avp_experiment import compare
 from avp_experiment.cells import COLLECT, RECONSTRUCT, TRAIN, plan
-from avp_experiment.configuration import DEFAULT, METHODS, PRESETS, Configuration, Scene, chosen_methods
+from avp_experiment.configuration import DEFAULT, PRESETS, Configuration, Scene, chosen_methods, known_methods
 from avp_experiment.folder import Folder, open_folder
 from avp_experiment.plots import style_of
 from avp_habitat import command
@@ -201,5 +201,5 @@ def test_the_configuration_that_is_kept_is_readable(tmp_path):
 
 
 def test_every_method_has_a_style_of_its_own():
-    styles = [style_of(method) for method in METHODS]
+    styles = [style_of(method) for method in known_methods()]
     assert len(set(styles)) == len(styles)
