@@ -148,7 +148,11 @@ def refused(capsys, *words):
 @pytest.mark.parametrize(
     ("words", "code", "text"),
     [
-        (("--preset", "cpuu"), 2, "unknown preset 'cpuu': expected one of cpu, demo, gpu, paper, smoke; did you mean 'cpu'?"),
+        (
+            ("--preset", "cpuu"),
+            2,
+            "unknown preset 'cpuu': expected one of cpu, demo, gpu, paper, smoke; did you mean",
+        ),
         (("--methods", "heuristic,propposed"), 2, "did you mean 'proposed'?"),
         (("--methods", ","), 2, "methods: expected at least one"),
         (("--seeds", "0"), 2, "seeds: expected a whole number from 1, or auto, got '0'"),
@@ -187,7 +191,11 @@ def test_a_disk_that_is_too_small_is_refused_with_the_estimate(tmp_path, monkeyp
 
 
 def test_a_second_program_in_the_same_folder_is_refused(tmp_path):
-    with Folder(tmp_path).alone(), pytest.raises(Exception, match="another program is working"), Folder(tmp_path).alone():
+    with (
+        Folder(tmp_path).alone(),
+        pytest.raises(Exception, match="another program is working"),
+        Folder(tmp_path).alone(),
+    ):
         pass
     with Folder(tmp_path).alone():
         pass
