@@ -271,9 +271,9 @@ class MLflowCallback(BaseCallback):
         tags = {KIND_TAG: "training"} | scene_tags(env)
         steps = self.model.num_timesteps
         if earlier is not None and earlier != run.run_id:
-            tags["avp.continued_from"] = earlier
+            tags[CONTINUED_TAG] = earlier
         elif steps > 0:
-            tags["avp.resumed_at_step"] = str(steps)
+            tags[RESUMED_TAG] = str(steps)
         run.params(params)
         run.tags(tags | self._tags)
         # MLflow keeps parameters as texts; here they are numbers, lists and truth values.
