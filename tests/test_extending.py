@@ -58,7 +58,7 @@ def write_distribution(folder, name, groups, files=()):
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\n")
     lines = [[f"[{group}]", *(f"{key} = {value}" for key, value in each.items())] for group, each in groups.items()]
-    (info / "entry_points.txt").write_text("\n".join(sum(lines, [])))
+    (info / "entry_points.txt").write_text("\n".join(line for each in lines for line in each))
 
 
 @pytest.fixture(scope="module")

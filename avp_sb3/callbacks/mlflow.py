@@ -25,7 +25,7 @@ from avp_habitat.rollout.images import write_rgb
 from avp_habitat.task.trajectory import Trajectory
 from avp_habitat.tracking.deliver import recover_in_background
 from avp_habitat.tracking.journal import spool_folder
-from avp_habitat.tracking.names import KIND_TAG
+from avp_habitat.tracking.names import CONTINUED_TAG, KIND_TAG, RESUMED_TAG
 from avp_habitat.tracking.run import NewRun, Status, TrackedRun, continue_run, join_run, may_continue, start_run
 from avp_habitat.tracking.stores import DEFAULT_ADDRESS, about_run, shown
 from avp_sb3.callbacks.base import LoggedFile, finished_episodes, is_learning
