@@ -282,7 +282,7 @@ def test_surface_maps_have_to_be_declared():
         def __call__(self, agents):
             return agents.surface_maps()
 
-    with pytest.raises(UsageError, match="surface_maps: .* needs_surface = True"):
+    with pytest.raises(UsageError, match=r"surface_maps: .* needs_surface = True"):
         AVPEnv(simulator=Corridor(), observation=Undeclared(), **SMALL).reset(seed=0)
     Undeclared.needs_surface = True
     assert AVPEnv(simulator=Corridor(), observation=Undeclared(), **SMALL).reset(seed=0)[0].shape == (8, 10, 10)

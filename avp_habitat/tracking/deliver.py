@@ -58,11 +58,8 @@ def finish(journal: Journal, *, again: bool = False, timeout_s: float = 30.0) ->
     if again:
         journal.restore_rejected()
     run = TrackedRun(journal, None, uncertain=True, interval_s=0.0)
-    if killed:
-        delivered = run.close("KILLED", at_ms=last_ms, timeout_s=timeout_s)
-    else:
-        delivered = run.leave(timeout_s=timeout_s)
-    return Recovered(run.run_id, run.address, header["ended"], delivered, killed and header["owned"])
+    ended = run.close("KILLED", at_ms=last_ms, timeout_s=timeout_s) if killed else run.leave(timeout_s=timeout_s)
+    return Recovered(run.run_id, run.address, header["ended"], ended, killed and header["owned"])
 
 
 def recover(spool: Path, *, timeout_s: float = 30.0, on_each: Callable[[Recovered], object] = lambda _: None) -> None:
