@@ -23,7 +23,7 @@ LIGHT = (
     "ranges",
     "rollout.format",
     "rollout.png",
-    "sight.coverage",
+    "sight.rules",
     "sight.visibility",
     "task.rewards",
     "task.trajectory",
