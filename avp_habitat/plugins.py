@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
 from avp_habitat.errors import UsageError, unknown_name
@@ -76,7 +76,7 @@ def name_of(thing: Any) -> str:
 
 
 @cache
-def _all_registered() -> EntryPoints:
+def _all_registered() -> Any:
     return entry_points()
 
 
