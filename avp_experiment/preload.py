@@ -4,7 +4,7 @@ import contextlib
 import importlib
 import warnings
 
-MODULES = ("avp_sb3", "avp_nerfstudio.method.preload", "avp_habitat.collect", "avp_experiment.execute")
+MODULES = ("avp_sb3", "avp_nerfstudio.method.reconstruction", "avp_habitat.collect", "avp_experiment.execute")
 """An extra that is not installed is missed by the commands that need it, in words of theirs."""
 
 # Hosts warn about each other's versions, on which nobody can act here.

@@ -174,7 +174,7 @@ def _train(config: Any, clock_of: Callable[[], Clock]) -> tuple[Any, Clock]:
 
 def _score(trainer: Any, pictures: Path, views: Sequence[int], every: int) -> list[dict[str, Any]]:
     from avp_habitat.rollout.images import write_rgb
-    from avp_nerfstudio.data.heldout import render_views, to_8_bit
+    from avp_nerfstudio.method.scores import render_views, to_8_bit
     from avp_nerfstudio.method.hash_encoding import compile_hash_encodings
 
     trainer.pipeline.eval()

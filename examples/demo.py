@@ -178,12 +178,10 @@ def read_row(method: str, rollout: Path, reconstruction: Reconstruction) -> tupl
     from avp_nerfstudio.tracking.mlflow import remembered_id
 
     meta = read_rollout(rollout).meta
-    found = read_scores(reconstruction.scores)
+    scores, lpips_reason = read_scores(reconstruction.scores)
     metrics = {f"eval/{name}": meta["metrics"][name] for name in ("views", "coverage", "annd_m", "ei", "path_length_m")}
-    metrics |= {"eval/psnr": found.psnr, "eval/ssim": found.ssim}
-    if found.lpips is not None:
-        metrics["eval/lpips"] = found.lpips
-    return Row(method, metrics, remembered_id(reconstruction.config.parent)), found.lpips_reason
+    metrics |= {f"eval/{name}": value for name, value in scores.items()}
+    return Row(method, metrics, remembered_id(reconstruction.config.parent)), lpips_reason
 
 
 def write_table(folder: Path, rows: Sequence[Row], settings: Settings) -> str:

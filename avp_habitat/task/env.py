@@ -236,7 +236,7 @@ def step_info(task: ViewpointTask, outcome: StepOutcome) -> list[dict[str, Any]]
     for row in np.flatnonzero(outcome.terminated | outcome.truncated):
         stopped = bool(outcome.terminated[row])
         trajectory = task.trajectory(int(row))
-        infos[row]["avp_episode"] = episode_metrics(trajectory, stopped=stopped)
+        infos[row]["avp_episode"] = episode_metrics(trajectory, stopped=stopped, further=task.settings.metrics)
         infos[row]["avp_trajectory"] = trajectory
         infos[row]["is_success"] = stopped
     return infos

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from avp_habitat.poses import Intrinsics, camera_to_world, habitat_to_opencv, yaw_and_pitch
 from avp_habitat.rollout.format import HELDOUT, Rollout, frame_name, read_rollout
-from avp_nerfstudio.check.cloud import rotation_matrix
 
 Float = NDArray[np.floating]
 
@@ -197,7 +197,7 @@ def _off(distance_m: float, turn_deg: float) -> Damage:
         shift, axis = (direction / np.linalg.norm(direction) for direction in rng.normal(size=(2, 3)))
         frame = rng.integers(len(frames))
         frames[frame, :3, 3] += distance_m * shift
-        frames[frame, :3, :3] = rotation_matrix(np.radians(turn_deg) * axis) @ frames[frame, :3, :3]
+        frames[frame, :3, :3] = Rotation.from_rotvec(np.radians(turn_deg) * axis).as_matrix() @ frames[frame, :3, :3]
         return replace(right, frames=frames)
 
     return damage
