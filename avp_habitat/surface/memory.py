@@ -2,7 +2,6 @@
 
 import hashlib
 import weakref
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -249,21 +248,3 @@ class RoomSurface:
     def quality(self, row: int) -> NDArray[np.float32]:
         """`(m,)` how well one agent has seen each point of its scene's surface, within [0, 1]."""
         return self._quality[self._row[row]]
-
-
-def room_surfaces(
-    simulators: Sequence[Simulator], settings: TaskSettings, room_of: NDArray[np.integer]
-) -> list[RoomSurface | None]:
-    """A memory for each scene; None where the settings need none.
-
-    Args:
-        simulators: one for each scene.
-        settings: of the task.
-        room_of: `(n,)` the scene of each agent.
-    """
-    if not settings.with_surface:
-        return [None] * len(simulators)
-    return [
-        RoomSurface(scene, settings, len(room_of), np.flatnonzero(room_of == index))
-        for index, scene in enumerate(simulators)
-    ]

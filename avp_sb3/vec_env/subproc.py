@@ -175,7 +175,8 @@ class AVPSubprocVecEnv(VecEnv):
             SimulatorError: the simulator cannot run here, or a worker ended.
         """
         gpus = list(gpu) if isinstance(gpu, Sequence) else [gpu]
-        choices = [SimulatorChoice(simulator, gpu=each, navmesh=Path(navmesh) if navmesh else None, up=up) for each in gpus]
+        file = Path(navmesh) if navmesh else None
+        choices = [SimulatorChoice(simulator, gpu=each, navmesh=file, up=up) for each in gpus]
         if not choices:
             raise UsageError("gpu: expected at least one, got none")
         self.scenes = scenes_given(scene, choices[0])
