@@ -1,6 +1,6 @@
 """Fills a room with furniture, none of it in another's place, the door free, the rest walkable."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,8 +25,9 @@ _MIDDLE_M = 1.6
 """Height at which the middle of a picture hangs."""
 _MAIN, _EXTRA, _SMALL = 0.45, 0.42, 0.41
 """Share of the floor that stays walkable after placing main groups, storage, and what fills corners."""
-_Spot = tuple[Wall, float, float]
-"""A wall, metres along it and metres in front of it."""
+_Spots = Callable[[Wall], list[Point]]
+"""Where a group may stand at a wall: metres along it and in front of it."""
+_MOST_SPOTS = 120
 
 
 def free_cells(shell: Shell, blocks: list[Rectangle]) -> NDArray[np.bool_]:
@@ -252,42 +253,32 @@ def _hang_lamp(floor: Floor, rng: Random, kit: Kit) -> None:
             return
 
 
-def _put(floor: Floor, arrange: Arrange, spots: Iterable[_Spot], least_share: float) -> bool:
-    """Place a group at the first spot where it fits and leaves enough of the floor walkable."""
-    for wall, right, inwards in spots:
-        group = arrange(floor.shell.depth_at(wall, right) - inwards)
-        if group is not None and floor.try_group(group, wall, right, inwards, least_share=least_share):
-            return True
+def _put(floor: Floor, rng: Random, arrange: Arrange, spots: _Spots, least_share: float) -> bool:
+    """Place a group at the first spot, in random order, where it fits and leaves enough of the floor walkable."""
+    for wall in rng.shuffled([wall for wall in floor.shell.walls if spots(wall)]):
+        for right, inwards in rng.shuffled(spots(wall))[:_MOST_SPOTS]:
+            group = arrange(floor.shell.depth_at(wall, right) - inwards)
+            if group is not None and floor.try_group(group, wall, right, inwards, least_share=least_share):
+                return True
     return False
 
 
-def _at_walls(floor: Floor, rng: Random) -> Iterator[_Spot]:
-    """Places along all walls in random order."""
-    for wall in rng.shuffled(floor.shell.walls):
-        for right in rng.shuffled(places(0.3, wall.length - 0.3, 0.2)):
-            yield wall, right, 0.0
+def _at_wall(wall: Wall) -> list[Point]:
+    return [(right, 0.0) for right in places(0.3, wall.length - 0.3, 0.2)]
 
 
-def _in_corners(floor: Floor, rng: Random, distance: float) -> Iterator[_Spot]:
-    """Places at walls, a distance in metres from their ends, in random order."""
-    for wall in rng.shuffled(floor.shell.walls):
-        for right in rng.shuffled([distance, wall.length - distance]):
-            yield wall, right, 0.0
+def _in_corners(wall: Wall) -> list[Point]:
+    return [(0.42, 0.0), (wall.length - 0.42, 0.0)]
 
 
-def _anywhere(floor: Floor, rng: Random) -> Iterator[_Spot]:
-    """Places in the open floor in random order."""
-    for wall in rng.shuffled(floor.shell.walls):
-        spots = [(r, i) for r in places(0.6, wall.length - 0.5, 0.3) for i in places(0.1, 4.0, 0.3)]
-        for right, inwards in rng.shuffled(spots)[:120]:
-            yield wall, right, inwards
+def _anywhere(wall: Wall) -> list[Point]:
+    return [(r, i) for r in places(0.6, wall.length - 0.5, 0.3) for i in places(0.1, 4.0, 0.3)]
 
 
-def _across(floor: Floor, rng: Random) -> Iterator[_Spot]:
-    """Places at long walls, away from their ends, in random order."""
-    for wall in rng.shuffled([wall for wall in floor.shell.walls if wall.length >= 3.0]):
-        for share in rng.shuffled([0.3, 0.36, 0.43, 0.5, 0.57, 0.64, 0.7]):
-            yield wall, round(wall.length * share, 2), 0.0
+def _across(wall: Wall) -> list[Point]:
+    """Away from the ends of a long wall."""
+    shares = (0.3, 0.36, 0.43, 0.5, 0.57, 0.64, 0.7)
+    return [(round(wall.length * share, 2), 0.0) for share in shares] if wall.length >= 3.0 else []
 
 
 def _storage(kit: Kit, rng: Random) -> list[Arrange]:
@@ -300,7 +291,7 @@ def _storage(kit: Kit, rng: Random) -> list[Arrange]:
 
 def _put_living(floor: Floor, rng: Random, kit: Kit) -> bool:
     """Sofa, television and what belongs to them, as much as fits."""
-    return any(_put(floor, arrange, _at_walls(floor, rng), _MAIN) for arrange in groups.living(kit, rng))
+    return any(_put(floor, rng, arrange, _at_wall, _MAIN) for arrange in groups.living(kit, rng))
 
 
 def _put_main_groups(floor: Floor, rng: Random, kit: Kit) -> None:
@@ -309,26 +300,26 @@ def _put_main_groups(floor: Floor, rng: Random, kit: Kit) -> None:
     sleeps = rng.chance(0.6 if area > 22 else 0.4)
     sits = area > 20 or not sleeps
     sits = sits and _put_living(floor, rng, kit)
-    sleeps = (sleeps or not sits) and _put(floor, groups.sleeping(kit, rng), _at_walls(floor, rng), _MAIN)
+    sleeps = (sleeps or not sits) and _put(floor, rng, groups.sleeping(kit, rng), _at_wall, _MAIN)
     if not sits and not sleeps:
         sits = _put_living(floor, rng, kit)
     if not (sits and sleeps) or area > 30:
-        _put(floor, groups.dining(kit, rng), _anywhere(floor, rng), _MAIN)
-    any(_put(floor, arrange, _across(floor, rng), _MAIN) for arrange in groups.divider(kit, rng, floor.shell.ceiling))
+        _put(floor, rng, groups.dining(kit, rng), _anywhere, _MAIN)
+    any(_put(floor, rng, arrange, _across, _MAIN) for arrange in groups.divider(kit, rng, floor.shell.ceiling))
 
 
 def _put_the_rest(floor: Floor, rng: Random, kit: Kit) -> None:
     """Desk, storage, a place to read, and what fills corners, as long as the floor stays walkable."""
     first, *rest = _storage(kit, rng)
     for arrange in (groups.working(kit, rng), first):
-        _put(floor, arrange, _at_walls(floor, rng), _EXTRA)
-    any(_put(floor, arrange, _at_walls(floor, rng), _EXTRA) for arrange in groups.reading(kit, rng))
+        _put(floor, rng, arrange, _at_wall, _EXTRA)
+    any(_put(floor, rng, arrange, _at_wall, _EXTRA) for arrange in groups.reading(kit, rng))
     for arrange in rest:
-        _put(floor, arrange, _at_walls(floor, rng), _EXTRA)
+        _put(floor, rng, arrange, _at_wall, _EXTRA)
     for _ in range(2):
-        _put(floor, groups.against_wall(decor.plant(kit, rng), 0.0), _in_corners(floor, rng, 0.42), _SMALL)
+        _put(floor, rng, groups.against_wall(decor.plant(kit, rng), 0.0), _in_corners, _SMALL)
     if sum(stand.piece.kind == "side table" for stand in floor.placed) < 2:
-        _put(floor, groups.against_wall(seating.side_table(kit, rng), 0.3), _at_walls(floor, rng), _SMALL)
+        _put(floor, rng, groups.against_wall(seating.side_table(kit, rng), 0.3), _at_wall, _SMALL)
 
 
 def furnish(shell: Shell, rng: Random, kit: Kit) -> list[Placed]:
