@@ -130,8 +130,8 @@ class _Glb:
 class Export:
     """Export a scene, most usefully a generated room, for other programs."""
 
-    scene: Positional[Annotated[str, arg(help=HELP)]]
-    out: Positional[Path]
+    scene: Positional[Annotated[str, arg(help=HELP, metavar="SCENE")]]
+    out: Positional[Annotated[Path, arg(metavar="OUT")]]
     """The .glb file to write; must not exist."""
     up: Annotated[Literal["y", "z"] | None, arg(help=UP_HELP)] = None
 
