@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, uniform_filter, zoom
 
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics, camera_to_world
-from avp_habitat.scenes.builtin.floorplan import largest_part
+from avp_habitat.scenes.builtin.furnish import largest_part
 from avp_habitat.scenes.builtin.kit import FLAT_M, Kit
 from avp_habitat.scenes.builtin.noise import Random, fractal
 from avp_habitat.scenes.builtin.room import generate_room, plan_room
