@@ -232,7 +232,7 @@ def track(demo: Demo, rows: Sequence[Row]) -> None:
 
 def record(demo: Demo, rollouts: Sequence[Path]) -> Path:
     """The rollouts side by side as one Rerun recording."""
-    from avp_sb3.rerun.recording import write_rollout_recording
+    from avp_sb3.rerun.rollout import write_rollout_recording
 
     target = demo.folder / "rollouts.rrd"
     _remove(target)
