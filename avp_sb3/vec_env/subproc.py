@@ -4,7 +4,7 @@ import signal
 import time
 import traceback
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing.process import BaseProcess
@@ -106,7 +106,7 @@ class AVPSubprocVecEnv(SubprocVecEnv):
             SimulatorError: the simulator cannot run here, or a worker ended.
         """
         gpus = list(gpu) if isinstance(gpu, Sequence) else [gpu]
-        choices = [SimulatorChoice(simulator, gpu=each, navmesh=navmesh and Path(navmesh), up=up) for each in gpus]
+        choices = [SimulatorChoice(simulator, gpu=each, navmesh=navmesh, up=up) for each in gpus]  # type: ignore[arg-type]
         if not choices:
             raise UsageError("gpu: expected at least one, got none")
         if start_method not in START_METHODS:
@@ -124,7 +124,7 @@ class AVPSubprocVecEnv(SubprocVecEnv):
         self.settings = settings or TaskSettings(lookup=simulator == "raycast")
         self._asked: list[int] = []
         self._fixed: dict[str, list[Any]] = {}
-        makes = [
+        makes: list[Callable[[], gymnasium.Env]] = [
             partial(
                 _Agents,
                 self.settings,
