@@ -1,4 +1,4 @@
-"""How well what the frames have seen predicts the reconstruction: points, and their rank correlations."""
+"""Means over seeds, differences between methods, and how well what the frames have seen predicts the reconstruction."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from avp_experiment.stored import Key, Results
-from avp_habitat.metrics import CONFIDENCE, mean_and_half_width
+from avp_experiment.results import Key, Results
+from avp_habitat.metrics import CONFIDENCE, FIGURES, Figure, mean_and_half_width
 
 RESAMPLES = 2000
 _BOOTSTRAP_SEED = 0
@@ -35,11 +35,11 @@ class Summary:
         """Upper end of the interval; nan for one seed."""
         return self.mean + self.half_width
 
-    def text(self, *, digits: int, scale: float = 1.0, sign: bool = False, unit: str = "") -> str:
-        """Mean ± half the interval, without ± for one seed."""
-        shown = f"{scale * self.mean:{'+' if sign else ''}.{digits}f}"
-        shown += "" if np.isnan(self.half_width) else f" ± {abs(scale) * self.half_width:.{digits}f}"
-        return f"{shown} {unit}".rstrip()
+    def text(self, name: str, *, sign: bool = False) -> str:
+        """Mean ± half the interval, without ± for one seed, as the figure of this name is shown; no unit."""
+        figure = figure_named(name)
+        shown = figure.text(self.mean, self.half_width)
+        return f"+{shown}" if sign and not shown.startswith("-") else shown
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,15 @@ class Correlation:
     rollouts: int
     """That they were made of; what the bootstrap draws."""
 
-    def text(self) -> str:
+    def __str__(self) -> str:
         """As ρ = 0.91 [0.85, 0.95]."""
         interval = "" if np.isnan(self.low) else f" [{self.low:.2f}, {self.high:.2f}]"
         return f"ρ = {self.rho:.2f}{interval}"
+
+
+def figure_named(name: str) -> Figure:
+    """How a figure is shown; one that a user added, by its name."""
+    return FIGURES.get(name) or Figure(name, name.replace("_", " "), digits=3)
 
 
 def per_seed(values: Mapping[Key, float]) -> dict[int, float]:
@@ -180,7 +185,7 @@ def _ranks(values: NDArray, times: NDArray) -> NDArray:
     return (np.cumsum(together, axis=1) - together / 2)[:, place]
 
 
-POINT_NAMES = ("visibility", "coverage")
+PREDICTORS = ("visibility", "coverage")
 """What may predict PSNR."""
 
 
@@ -190,32 +195,14 @@ class Point:
 
     method: str
     """That took its views."""
-    scene: str
-    """Its name."""
     rollout: tuple[str, str, int, int]
     """Method, scene, seed and start."""
     whole: bool
     """Whether it was made of all frames of its episode."""
-    visibility: float
-    """Share of the held-out pixels that its frames have seen."""
-    coverage: float
-    """Share of the navigable cells that its frames have observed."""
+    shares: Mapping[str, float]
+    """Of the held-out pixels (`visibility`) and of the navigable cells (`coverage`) that its frames have seen."""
     psnr: float
     """In dB."""
-
-    def share(self, name: str) -> float:
-        """Visibility or coverage."""
-        return self.visibility if name == "visibility" else self.coverage
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A correlation with its name."""
-
-    where: str
-    """Which reconstructions."""
-    found: Correlation | None
-    """None where there are too few."""
 
 
 def points_of(results: Results) -> list[Point]:
@@ -223,37 +210,34 @@ def points_of(results: Results) -> list[Point]:
     curves = {(one.method, *one.key): one.coverage_curve for one in results.rollouts}
     points = []
     for one in results.reconstructions:
-        curve = curves.get((one.method, *one.key), ())
-        if one.visibility is None or "psnr" not in one.scores or not 1 <= one.frames <= len(curve):
-            continue
         rollout = (one.method, *one.key)
-        points.append(
-            Point(one.method, one.key[0], rollout, one.whole, one.visibility, curve[one.frames - 1], one.scores["psnr"])
-        )
+        curve = curves.get(rollout, ())
+        if one.visibility is not None and "psnr" in one.scores and 1 <= one.frames <= len(curve):
+            shares = {"visibility": one.visibility, "coverage": curve[one.frames - 1]}
+            points.append(Point(one.method, rollout, one.whole, shares, one.scores["psnr"]))
     return points
 
 
-def correlations(points: Sequence[Point], name: str) -> list[Entry]:
-    """Spearman's ρ of visibility or coverage with PSNR: over all, of whole episodes, of first frames, in each scene.
+def correlations(points: Sequence[Point], name: str) -> dict[str, Correlation | None]:
+    """Spearman's ρ of a predictor with PSNR: over all, of whole episodes, of first frames, in each scene.
 
     Args:
         points: of all reconstructions.
-        name: visibility or coverage.
+        name: of `PREDICTORS`.
+
+    Returns:
+        By what was correlated; None where there are too few points.
     """
-    whole = [point for point in points if point.whole]
-    groups = {"all": list(points), "whole episodes": whole, "first frames": [one for one in points if not one.whole]}
-    scenes = list(dict.fromkeys(point.scene for point in points))
+    groups = {
+        "all": list(points),
+        "whole episodes": [point for point in points if point.whole],
+        "first frames": [point for point in points if not point.whole],
+    }
+    scenes = list(dict.fromkeys(point.rollout[1] for point in points))
     for scene in scenes if len(scenes) > 1 else []:
-        groups[f"all in {scene}"] = [point for point in points if point.scene == scene]
-        groups[f"whole episodes in {scene}"] = [point for point in whole if point.scene == scene]
-    return [
-        Entry(
-            where,
-            spearman(
-                [point.share(name) for point in group],
-                [point.psnr for point in group],
-                [point.rollout for point in group],
-            ),
-        )
+        groups[f"all in {scene}"] = [point for point in points if point.rollout[1] == scene]
+        groups[f"whole episodes in {scene}"] = [point for point in groups[f"all in {scene}"] if point.whole]
+    return {
+        where: spearman([p.shares[name] for p in group], [p.psnr for p in group], [p.rollout for p in group])
         for where, group in groups.items()
-    ]
+    }

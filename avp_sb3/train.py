@@ -16,7 +16,7 @@ from avp_habitat.policies.registry import TRUSTED, load_model
 from avp_habitat.policies.saved_model import is_normalised, load_statistics, statistics_of
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.simulators.registry import ONE_PER_PROCESS, SimulatorChoice
+from avp_habitat.simulators.registry import SimulatorChoice
 from avp_habitat.task.rewards import REWARD_NAMES
 from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
@@ -88,7 +88,7 @@ class Train:
         return TaskSettings(
             reward=self.reward,
             observation=self.observation,
-            lookup=not self.rays and self.simulator.simulator == "raycast",
+            lookup=not self.rays and self.simulator.single_rays,
             width=self.width,
             height=self.height,
         )
@@ -102,16 +102,18 @@ def _environment(options: Train) -> Any:
 
     choice, scenes = options.simulator, list(options.scene)
     common = {"agents": options.preset.n_envs, "settings": options.settings, "seed": options.seed, **vars(choice)}
-    if options.workers is None and (len(scenes) == 1 or choice.simulator not in ONE_PER_PROCESS):
+    if options.workers is None and (len(scenes) == 1 or not choice.one_per_process):
         return VecMonitor(AVPVecEnv(scenes, **common))
     return VecMonitor(AVPSubprocVecEnv(scenes, workers=options.workers, **common))
 
 
 def _model(options: Train, env: Any) -> Any:
     if options.resume is None:
+        from gymnasium import spaces
         from stable_baselines3 import PPO
 
-        return PPO("MlpPolicy", env, device="cpu", seed=options.seed, **options.preset.arguments())
+        policy = "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy"
+        return PPO(policy, env, device="cpu", seed=options.seed, **options.preset.arguments())
     with tempfile.TemporaryDirectory() as folder:
         path = _resumed_file(options.resume, folder)
         if (statistics := statistics_of(path)) is not None:

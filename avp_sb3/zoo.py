@@ -12,15 +12,14 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 from avp_habitat.errors import UsageError
 from avp_habitat.scenes.location import locate
-from avp_habitat.simulators.base import Simulator
-from avp_habitat.simulators.registry import ONE_PER_PROCESS, SimulatorChoice, open_simulator
+from avp_habitat.simulators.base import Simulator, SingleRays
+from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.task.settings import TaskSettings
 from avp_sb3.vec_env.batched import AVPVecEnv
 from avp_sb3.vec_env.subproc import AVPSubprocVecEnv
 
 _REPLACED = {"Monitor", "OrderEnforcing", "PassiveEnvChecker"}
 """Wrappers whose work the batch does itself, or does not need."""
-_WITH_LOOKUP = "raycast"
 _HOOK = "avp_sb3.zoo.Batched"
 
 
@@ -58,10 +57,10 @@ def Batched(venv: VecEnv, *, scenes: Sequence[str | Path] = (), lookup: bool = T
     for scene in scenes:
         locate(scene)
     choice = venv.get_attr("choice")[0]
-    name = choice.simulator if choice else venv.get_attr("simulator")[0].name
+    rays = choice.single_rays if choice else isinstance(venv.get_attr("simulator")[0], SingleRays)
     options = {
         "agents": venv.num_envs,
-        "settings": replace(_settings(venv), lookup=lookup and name == _WITH_LOOKUP),
+        "settings": replace(_settings(venv), lookup=lookup and rays),
         "seed": venv._seeds[0],
     }
     files = _monitor_files(venv)
@@ -108,9 +107,9 @@ def _simulators(venv: VecEnv, choice: SimulatorChoice | None, scenes: Sequence[s
     if not scenes:
         return _shortest_cycle(own)
     choice = choice or SimulatorChoice(own[0].name)
-    if choice.simulator in ONE_PER_PROCESS and len(scenes) > 1:
+    if choice.one_per_process and len(scenes) > 1:
         raise UsageError(
-            f"{_HOOK}: scenes: a process can hold one simulator of {choice.simulator!r}, got {len(scenes)} scenes; add "
+            f"{_HOOK}: scenes: a process can hold one simulator of {choice.name!r}, got {len(scenes)} scenes; add "
             f"--vec-env subproc and set n_envs:{len(scenes)}, with n_steps so that their product is PPO's buffer"
         )
     return [open_simulator(choice, scene) for scene in scenes]

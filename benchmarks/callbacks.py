@@ -28,7 +28,7 @@ from tqdm import tqdm
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.task.rewards import check_reward
+from avp_habitat.task.rewards import find_reward
 from avp_sb3.presets import TABLE_4
 
 _BUFFER = TABLE_4.n_envs * TABLE_4.n_steps
@@ -70,7 +70,7 @@ def main(argv: Sequence[str]) -> None:
     reporting.check_least(options, agents=1, repeats=1, steps=1, delay_steps=1, episodes=1, seed=0)
     if _BUFFER % options.agents:
         raise UsageError(f"--agents: expected a divisor of {_BUFFER}, got {options.agents}")
-    check_reward(options.reward)
+    find_reward(options.reward)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with reporting.own_folders(folder), reporting.reported("callbacks", options) as results:

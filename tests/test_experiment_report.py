@@ -11,7 +11,7 @@ from PIL import Image
 from scipy import stats
 
 from avp_experiment.report import main, write_report
-from avp_experiment.stored import read_results
+from avp_experiment.results import read_results
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
 

@@ -15,10 +15,10 @@ from avp_habitat.sight.coverage import candidates
 from avp_habitat.sight.rows import Lattice, TileFiles, cache_folder
 from avp_habitat.sight.tables import SceneTables, ViewKey, scene_tables
 from avp_habitat.simulators.registry import make_simulator
-from avp_habitat.task.observations import depth_statistics
-from avp_habitat.task.perception import CastSenses, Views
+from avp_habitat.task.cast import CastSensor
 from avp_habitat.task.settings import TaskSettings
 from avp_habitat.task.task import ViewpointTask
+from avp_habitat.task.views import Views, depth_statistics
 
 SETTINGS = TaskSettings(reward="coverage", lookup=True)
 CAMERA = SETTINGS.intrinsics
@@ -63,7 +63,7 @@ def test_whole_episodes_cover_the_same_and_read_depths_within_one_percent_of_the
 
 def test_cells_that_are_looked_up_are_those_that_rays_reach(room):
     task = ViewpointTask(room, SETTINGS, agents=1)
-    cast = CastSenses(room, SETTINGS)
+    cast = CastSensor(room, SETTINGS)
     views = views_at(room.area, 30, seed=3)
     cells = len(room.area.centres)
     by_ray, looked_up = np.zeros((2, 30, cells), dtype=np.int16)

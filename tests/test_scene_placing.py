@@ -13,10 +13,9 @@ from avp_habitat.errors import SceneError, UsageError
 from avp_habitat.scenes.builtin.room import generate_room
 from avp_habitat.scenes.export import export_glb
 from avp_habitat.scenes.export import main as export
-from avp_habitat.scenes.loader import identify, load_scene
+from avp_habitat.scenes.loader import identify, load_scene, looks_z_up
 from avp_habitat.scenes.location import Frame, locate
 from avp_habitat.scenes.mesh import TexturedMesh
-from avp_habitat.scenes.placing import looks_z_up
 from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.task.env import AVPEnv
 from avp_nerfstudio.check.__main__ import main as check

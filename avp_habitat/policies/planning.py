@@ -155,6 +155,13 @@ def _shortest_walks(navigable, start_row, start_column):
     return length, before
 
 
+def action_shape(observation: Any, agents: int) -> tuple[int, ...]:
+    """Of the actions for observations of any kind: `(n,)`, or `()` for one agent alone."""
+    if agents > 1:
+        return (agents,)
+    return (1,) if np.ndim(observation) == 2 and len(observation) == 1 else ()
+
+
 class Planner(Protocol):
     """Plans for one agent within one episode."""
 
@@ -193,7 +200,7 @@ class PlanningPolicy:
             self._generators = [self._generator(index) for index in range(len(views))]
             self._planners, self._steps = [None] * len(views), [0] * len(views)
         actions = np.array([self._act(index, view) for index, view in enumerate(views)], dtype=np.int64)
-        return actions.reshape(np.shape(observation)[:-1]), None
+        return actions.reshape(action_shape(observation, len(views))), None
 
     def make_planner(self, rng: np.random.Generator) -> Planner:
         """A planner for one episode of one agent, which may draw from `rng`."""

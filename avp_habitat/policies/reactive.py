@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.policies.planning import FREE, UNKNOWN, KnownMap, PlanningPolicy, known_map
+from avp_habitat.policies.planning import FREE, UNKNOWN, KnownMap, PlanningPolicy, action_shape, known_map
 from avp_habitat.policies.predicted_views import in_view, make_lens
 from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.settings import ACTION_NAMES, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT
@@ -56,20 +56,27 @@ CLEARANCE_M = 1.0
 class RandomPolicy:
     """Any of the six actions, with equal odds."""
 
-    def __init__(self, seed: int | None = None) -> None:
-        """Start a random generator of its own."""
+    def __init__(self, seed: int | None = None, agents: int | None = None) -> None:
+        """Start a random generator of its own.
+
+        Args:
+            seed: of it.
+            agents: n; where it is omitted, observations are arrays `(n, k)` or `(k,)`.
+        """
         self._rng = np.random.default_rng(seed)
+        self._agents = agents
 
     @classmethod
     def for_env(cls, env: Any, seed: int | None = None) -> "RandomPolicy":
-        """The random policy, which asks nothing of the environment."""
-        return cls(seed)
+        """The random policy for an `AVPEnv` or a vector environment of them."""
+        return cls(seed, getattr(env, "num_envs", 1))
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.int64], Any]:
         """Actions for `(n, 12)` observations, `(n,)`, or for one `(12,)` observation, `()`; the state is None."""
-        return self._rng.integers(len(ACTION_NAMES), size=np.shape(observation)[:-1]), None
+        shape = np.shape(observation)[:-1] if self._agents is None else action_shape(observation, self._agents)
+        return self._rng.integers(len(ACTION_NAMES), size=shape), None
 
 
 class HeuristicPolicy:
@@ -100,7 +107,7 @@ class HeuristicPolicy:
         depth = self._centre_depth()
         turn = np.where(self._rng.random(len(depth)) < 0.5, TURN_LEFT, TURN_RIGHT)
         action = np.where(depth > CLEARANCE_M, MOVE_FORWARD, turn).astype(np.int64)
-        return action.reshape(np.shape(observation)[:-1]), None
+        return action.reshape(action_shape(observation, len(depth))), None
 
 
 WALK_M = 2.0

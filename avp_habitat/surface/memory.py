@@ -15,8 +15,8 @@ from avp_habitat.sight.tables import SPACING_M, seen_bits, single_rays
 from avp_habitat.simulators.base import Simulator, SingleRays
 from avp_habitat.surface.map import SurfaceMapper
 from avp_habitat.surface.points import FULL_DISTANCE_M, SceneSurface, scene_surface, view_quality
-from avp_habitat.task.perception import Views
 from avp_habitat.task.settings import TaskSettings
+from avp_habitat.task.views import Views
 
 _VERSION = 1
 
@@ -74,7 +74,7 @@ class TableSurface:
         self._doubtful, self._doubtful_q = _room_for(4096)
 
     def capture(self, views: Views, quality: NDArray[np.float32], rows: NDArray[np.integer]) -> NDArray[np.float64]:
-        """See `SurfaceSenses`."""
+        """See `SurfaceSensor`."""
         slots, points = self._tables.around(views.position), self._tables.surface.points
         gain = np.zeros(len(slots))
         doubts = self._sure_points(views, slots, quality, rows, gain)
@@ -133,7 +133,7 @@ def surface_tables(simulator: SingleRays, settings: TaskSettings) -> SurfaceTabl
     return known[key]
 
 
-class SurfaceSenses(Protocol):
+class SurfaceSensor(Protocol):
     """Perceives how well the views of agents in one scene show its surface."""
 
     def capture(self, views: Views, quality: NDArray[np.float32], rows: NDArray[np.integer]) -> NDArray[np.float64]:
@@ -160,7 +160,7 @@ class CastSurface:
         self._surface = scene_surface(simulator, settings)
 
     def capture(self, views: Views, quality: NDArray[np.float32], rows: NDArray[np.integer]) -> NDArray[np.float64]:
-        """See `SurfaceSenses`."""
+        """See `SurfaceSensor`."""
         settings, surface = self._settings, self._surface
         eye = views.camera_to_world[:, None, :3, 3]
         found = view_quality(eye, surface.points[None], surface.normals[None]).astype(np.float32)
@@ -198,15 +198,13 @@ def raise_quality(
     return grown
 
 
-def make_surface_senses(simulator: Simulator, settings: TaskSettings) -> SurfaceSenses:
-    """The senses that the settings ask for.
+def make_surface_sensor(simulator: Simulator, settings: TaskSettings) -> SurfaceSensor:
+    """The sensor that the settings ask for.
 
     Raises:
         UsageError: tables are asked for where they cannot be made, or the scene shows no surface.
     """
     if settings.lookup:
-        pass
-
         return TableSurface(simulator, settings)
     return CastSurface(simulator, settings)
 
@@ -230,7 +228,7 @@ class RoomSurface:
             UsageError: the simulator cannot do what the settings ask for, or the scene shows no surface.
         """
         surface = scene_surface(simulator, settings)
-        self._senses = make_surface_senses(simulator, settings)
+        self._sensor = make_surface_sensor(simulator, settings)
         self._mapper = SurfaceMapper(surface, settings.sensor_height_m)
         self._row = np.zeros(agents, dtype=np.int64)
         self._row[rows] = np.arange(len(rows))
@@ -242,10 +240,10 @@ class RoomSurface:
 
     def capture(self, views: Views, rows: Rows) -> NDArray[np.float64]:
         """`(k,)` ΔS of the newest views of k agents, which are remembered."""
-        return self._senses.capture(views, self._quality, self._row[rows])
+        return self._sensor.capture(views, self._quality, self._row[rows])
 
     def observe(self, rows: Rows, position: NDArray[np.floating], yaw: NDArray[np.floating]) -> NDArray[np.float32]:
-        """`(k, surface_map.SIZE)` what k agents know of the surface; see `SurfaceMapper.observe`."""
+        """`(k, map.SIZE)` what k agents know of the surface; see `SurfaceMapper.observe`."""
         return self._mapper.observe(self._quality, self._row[rows], position, yaw)
 
     def quality(self, row: int) -> NDArray[np.float32]:

@@ -7,14 +7,14 @@ from avp_habitat.errors import UsageError
 from avp_habitat.sight import kernels, panorama
 from avp_habitat.sight.tables import scene_tables, single_rays
 from avp_habitat.simulators.base import Simulator
-from avp_habitat.task.perception import Float, Perception, Views, centre_depth
 from avp_habitat.task.settings import TaskSettings
+from avp_habitat.task.views import Shown, Views
 
 _YAW_STEP = 2 * np.pi / panorama.YAWS
 _PITCH_STEP = np.radians(panorama.PITCH_STEP_DEG)
 
 
-class TableSenses:
+class TableSensor:
     """Depth statistics interpolated between the tables' places; cells on which the places differ are cast as rays."""
 
     def __init__(self, simulator: Simulator, settings: TaskSettings) -> None:
@@ -40,15 +40,15 @@ class TableSenses:
         )
         self._doubtful = np.empty((4096, 2), dtype=np.int64)
 
-    def look(self, views: Views) -> Perception:
-        """See `Senses`."""
+    def look(self, views: Views) -> Shown:
+        """See `Sensor`."""
         slots, weights = self._tables.around(views.position)
-        return self._perceive(views, slots, weights, np.zeros(len(slots), dtype=np.int64))
+        return self._shown(views, slots, weights, np.zeros(len(slots), dtype=np.int64))
 
     def capture(
         self, views: Views, first_seen: NDArray[np.int16], rows: NDArray[np.integer], steps: NDArray[np.integer]
-    ) -> Perception:
-        """See `Senses`."""
+    ) -> Shown:
+        """See `Sensor`."""
         slots, weights = self._tables.around(views.position)
         found = np.zeros(len(slots), dtype=np.int64)
         pairs = self._sure_cells(views, slots, first_seen, rows, steps, found)
@@ -58,11 +58,7 @@ class TableSenses:
             agent, cell = pairs[reached].T
             first_seen[rows[agent], cell] = steps[agent]
             found += np.bincount(agent, minlength=len(found))
-        return self._perceive(views, slots, weights, found)
-
-    def centre_depth(self, views: Views) -> Float:
-        """See `Senses`; one ray for each view."""
-        return centre_depth(self._simulator, self._settings, views)
+        return self._shown(views, slots, weights, found)
 
     def _sure_cells(
         self,
@@ -94,9 +90,9 @@ class TableSenses:
             # Once more with enough room: the sure cells are marked by now and not found again.
             self._doubtful = np.empty((2 * doubts, 2), dtype=np.int64)
 
-    def _perceive(
+    def _shown(
         self, views: Views, slots: NDArray[np.int32], weights: NDArray[np.float32], found: NDArray[np.int64]
-    ) -> Perception:
+    ) -> Shown:
         least, mean = np.empty(len(slots)), np.empty(len(slots))
         kernels.depth_statistics(
             self._tables.statistics,
@@ -107,4 +103,4 @@ class TableSenses:
             least,
             mean,
         )
-        return Perception(least, mean, found)
+        return Shown(least, mean, found)

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from avp_habitat.errors import UsageError, unknown_name
 from avp_habitat.metrics import FIGURES
-from avp_habitat.simulators.registry import ONE_PER_PROCESS, SimulatorChoice
+from avp_habitat.simulators.registry import SimulatorChoice
 from avp_habitat.task.settings import TaskSettings
 from avp_sb3.callbacks.base import NOT_FOR, LoggedFile, MissingInfoError, is_learning, record
 from avp_sb3.callbacks.best_model import WHEN, BestModel, statistics_of
@@ -167,8 +167,8 @@ class EvaluationCallback(BaseCallback):
                     "settings, or an eval_env of its own kind"
                 )
             # Only rays can be looked up.
-            settings = replace(settings, lookup=settings.lookup and self._choice.simulator == "raycast")
-        vec_env = AVPSubprocVecEnv if self._choice.simulator in ONE_PER_PROCESS else AVPVecEnv
+            settings = replace(settings, lookup=settings.lookup and self._choice.single_rays)
+        vec_env = AVPSubprocVecEnv if self._choice.one_per_process else AVPVecEnv
         agents = self._episodes * len(self._scenes)
         return vec_env(self._scenes, agents=agents, settings=settings, **vars(self._choice))
 

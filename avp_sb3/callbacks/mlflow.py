@@ -23,9 +23,10 @@ from avp_habitat.provenance import flat
 from avp_habitat.rollout.drawing import draw_trajectory
 from avp_habitat.rollout.images import write_rgb
 from avp_habitat.task.trajectory import Trajectory
+from avp_habitat.tracking.deliver import recover_in_background
 from avp_habitat.tracking.journal import spool_folder
-from avp_habitat.tracking.opening import NewRun, continue_run, join_run, may_continue, recover_in_background, start_run
-from avp_habitat.tracking.run import Status, TrackedRun
+from avp_habitat.tracking.names import CONTINUED_TAG, KIND_TAG, RESUMED_TAG
+from avp_habitat.tracking.run import NewRun, Status, TrackedRun, continue_run, join_run, may_continue, start_run
 from avp_habitat.tracking.stores import DEFAULT_ADDRESS, about_run, shown
 from avp_sb3.callbacks.base import LoggedFile, finished_episodes, is_learning
 from avp_sb3.callbacks.run_facts import hyperparameters, run_name, scene_tags, task_settings
@@ -267,12 +268,12 @@ class MLflowCallback(BaseCallback):
     def _log_facts(self, run: TrackedRun, earlier: str | None) -> None:
         env = self.training_env
         params = hyperparameters(self.model) | task_settings(env) | flat(self._params)
-        tags = {"avp.kind": "training"} | scene_tags(env)
+        tags = {KIND_TAG: "training"} | scene_tags(env)
         steps = self.model.num_timesteps
         if earlier is not None and earlier != run.run_id:
-            tags["avp.continued_from"] = earlier
+            tags[CONTINUED_TAG] = earlier
         elif steps > 0:
-            tags["avp.resumed_at_step"] = str(steps)
+            tags[RESUMED_TAG] = str(steps)
         run.params(params)
         run.tags(tags | self._tags)
         # MLflow keeps parameters as texts; here they are numbers, lists and truth values.

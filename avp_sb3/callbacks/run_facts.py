@@ -9,6 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from avp_habitat.provenance import flat
+from avp_habitat.task.settings import TaskSettings
 
 _NOT_HYPERPARAMETERS = {"self", "env", "policy", "verbose", "tensorboard_log", "_init_setup_model"}
 
@@ -35,7 +36,7 @@ def task_settings(env: VecEnv) -> dict[str, Any]:
     facts: dict[str, Any] = {}
     settings = env.get_attr("settings", 0)[0] if env.has_attr("settings") else None
     if dataclasses.is_dataclass(settings) and not isinstance(settings, type):
-        facts |= dataclasses.asdict(settings)
+        facts |= settings.facts() if isinstance(settings, TaskSettings) else dataclasses.asdict(settings)
     spec = env.get_attr("spec", 0)[0] if env.has_attr("spec") else None
     if spec is not None:
         facts["id"] = spec.id

@@ -19,10 +19,10 @@ from avp_habitat import tables
 from avp_habitat.metrics import FIGURES, explained, mean_and_half_width
 from avp_habitat.provenance import flat
 from avp_habitat.rollout.images import read_rgb
-from avp_habitat.tracking.experiments import experiment_id, meant
-from avp_habitat.tracking.names import safe_name
+from avp_habitat.tracking.experiments import chosen_experiment, experiment_id
+from avp_habitat.tracking.names import COLOUR_TAG, NOTE_TAG, safe_name
 from avp_habitat.tracking.stores import DEFAULT_ADDRESS, TrackingError, connect, first_line, shown
-from avp_habitat.tracking.view import COLOUR_TAG, NOTE_TAG, prepare_experiment, run_colour
+from avp_habitat.tracking.view import prepare_experiment, run_colour
 from avp_sb3.evaluation.policy import PolicyResult
 from avp_sb3.evaluation.report import PLOT_FILE, ReportError, cells, cpv, summary
 
@@ -54,7 +54,7 @@ def track_evaluation(
         about: what was evaluated, as `avp_sb3.evaluate` writes it; becomes parameters. Unless it is `complete`, the
             runs are marked as interrupted.
         folder: of the report; its files become artifacts of the upper run.
-        experiment: MLflow experiment, made when it does not exist; as `experiments.meant` says when None.
+        experiment: MLflow experiment, made when it does not exist; as `experiments.chosen_experiment` says when None.
         pictures: `(h, w, 3)` by policy, for those that have one.
 
     Raises:
@@ -67,7 +67,7 @@ def track_evaluation(
     address = mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else DEFAULT_ADDRESS
     try:
         client = connect(address)
-        identity, _ = experiment_id(client, *meant(experiment))
+        identity = experiment_id(client, *chosen_experiment(experiment))
         prepare_experiment(client, identity)
         parent = _log(client, identity, results, about, folder, pictures)
         name = client.get_experiment(identity).name

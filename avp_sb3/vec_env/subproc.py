@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from avp_habitat.errors import AVPError, SimulatorError, UsageError
 from avp_habitat.simulators.registry import SimulatorChoice
-from avp_habitat.task.observations import action_space, observation_space
+from avp_habitat.task.observations import Observed, action_space, each, make_observation
 from avp_habitat.task.settings import TaskSettings
 from avp_sb3.vec_env.batched import AVPVecEnv, scenes_given
 
@@ -44,7 +44,7 @@ class _Agents(gymnasium.Env):
     def __init__(self, settings: TaskSettings, **options: Any) -> None:
         # Ctrl-C is left to the parent, which ends its workers.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        self.observation_space, self.action_space = observation_space(settings.observation), action_space()
+        self.observation_space, self.action_space = make_observation(settings).space, action_space()
         self._open = partial(AVPVecEnv, settings=settings, **options)
         self._agents: AVPVecEnv | None = None
 
@@ -106,7 +106,8 @@ class AVPSubprocVecEnv(SubprocVecEnv):
             SimulatorError: the simulator cannot run here, or a worker ended.
         """
         gpus = list(gpu) if isinstance(gpu, Sequence) else [gpu]
-        choices = [SimulatorChoice(simulator, gpu=each, navmesh=navmesh, up=up) for each in gpus]  # type: ignore[arg-type]
+        file = Path(navmesh) if navmesh else None
+        choices = [SimulatorChoice(simulator, gpu=number, navmesh=file, up=up) for number in gpus]
         if not choices:
             raise UsageError("gpu: expected at least one, got none")
         if start_method not in START_METHODS:
@@ -121,7 +122,7 @@ class AVPSubprocVecEnv(SubprocVecEnv):
         agents = count if agents is None else agents
         if agents < count:
             raise UsageError(f"agents: expected at least {count}, one for each worker, got {agents}")
-        self.settings = settings or TaskSettings(lookup=simulator == "raycast")
+        self.settings = settings or TaskSettings(lookup=choices[0].single_rays)
         self._asked: list[int] = []
         self._fixed: dict[str, list[Any]] = {}
         makes: list[Callable[[], gymnasium.Env]] = [
@@ -145,8 +146,8 @@ class AVPSubprocVecEnv(SubprocVecEnv):
             raise
         self.seed(seed)
 
-    def reset(self) -> NDArray[np.float32]:  # type: ignore[override]
-        """Start all episodes at random; `(n, 12)`, longer with a map."""
+    def reset(self) -> Observed:  # type: ignore[override]
+        """Start all episodes at random; the first axis of what is observed is n."""
         self._send_parts("seed_agents", self._seeds)
         self._receive()
         self._send("reset", {worker: ((), {}) for worker in self._workers})
@@ -154,19 +155,19 @@ class AVPSubprocVecEnv(SubprocVecEnv):
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{"coverage": 0.0, "views": 0} for _ in range(self.num_envs)]
-        return self._joined(observations)
+        return each(self._joined, *observations)
 
     def step_async(self, actions: NDArray[np.integer]) -> None:
         """Send the `(n,)` actions to the workers."""
         self._send_parts("step", np.asarray(actions))
 
-    def step_wait(self) -> tuple[NDArray, NDArray, NDArray, list[dict[str, Any]]]:  # type: ignore[override]
+    def step_wait(self) -> tuple[Observed, NDArray, NDArray, list[dict[str, Any]]]:  # type: ignore[override]
         """What all agents saw; those whose episode ended start the next one, as SB3 expects."""
         observations, rewards, dones, own_infos = zip(*self._receive().values(), strict=True)
         infos: list[dict[str, Any]] = [{}] * self.num_envs
         for worker, own in enumerate(own_infos):
             infos[worker :: self._count] = own
-        return self._joined(observations), self._joined(rewards), self._joined(dones), infos
+        return each(self._joined, *observations), self._joined(*rewards), self._joined(*dones), infos
 
     def close(self) -> None:
         """End the workers, also those that do not answer."""
@@ -256,8 +257,7 @@ class AVPSubprocVecEnv(SubprocVecEnv):
     def _name(self, worker: int) -> str:
         return f"worker {worker} of {self._count} (scene {self.scenes[worker % len(self.scenes)]})"
 
-    def _joined(self, parts: Iterable[NDArray]) -> NDArray:
-        arrays = list(parts)
+    def _joined(self, *arrays: NDArray) -> NDArray:
         joined = np.empty((self.num_envs, *arrays[0].shape[1:]), arrays[0].dtype)
         for worker, array in enumerate(arrays):
             joined[worker :: self._count] = array

@@ -11,6 +11,7 @@ from avp_habitat.errors import UsageError
 from avp_habitat.policies.oracle.lattice import lattice_of, pack, start_state
 from avp_habitat.policies.oracle.search import BeamSettings, beam_search
 from avp_habitat.policies.oracle.tour import covering_tour
+from avp_habitat.policies.planning import action_shape
 from avp_habitat.sight.coverage import candidates
 from avp_habitat.task.agent_view import AgentView, agent_views
 from avp_habitat.task.motion import act, sensor_poses
@@ -142,7 +143,7 @@ class OraclePolicy:
             UsageError: the task does not count visible cells.
         """
         actions = np.array([self._action(agent, view) for agent, view in enumerate(self._views())], dtype=np.int64)
-        return actions.reshape(np.shape(observation)[:-1]), None
+        return actions.reshape(action_shape(observation, len(actions))), None
 
     def _action(self, agent: int, view: AgentView) -> int:
         if view.steps == 0 or self._next.get(agent) != view.steps:
