@@ -168,7 +168,7 @@ def _callbacks(options: Train, tracking: Any) -> list[Any]:
     # First, so that scenes that cannot be opened leave no empty run behind.
     if options.eval_scene is not None:
         best = options.out.with_stem(f"{options.out.stem}-best")
-        where = vars(options.simulator) | {"navmesh": None}  # That is the training scene's.
+        where: dict[str, Any] = vars(options.simulator) | {"navmesh": None}  # That is the training scene's.
         callbacks.append(EvaluationCallback(options.eval_scene, every=options.eval_every, best_model=best, **where))
     callbacks += [MetricsCallback(), tracking]
     if options.recording is not None:
