@@ -27,7 +27,7 @@ from avp_habitat import command
 from avp_habitat.errors import AVPError
 from avp_habitat.provenance import git_commit
 
-PRELOAD = ("avp_sb3", "avp_nerfstudio.method.preload", "avp_habitat.collect", "avp_experiment.runner")
+PRELOAD = ("avp_sb3", "avp_nerfstudio.method.reconstruction", "avp_habitat.collect", "avp_experiment.runner")
 """Everything heavy that cells use; multiprocessing passes over what is not installed."""
 _MLFLOW_OURS = ("MLFLOW_RUN_ID", "MLFLOW_EXPERIMENT_ID", "MLFLOW_EXPERIMENT_NAME")
 _TERMINATION_S = 30.0

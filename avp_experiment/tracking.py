@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from avp_habitat.provenance import flat
-from avp_habitat.tracking.comparison import METHOD_TAG, POLICY_TAG, SCENE_TAG
-from avp_habitat.tracking.experiments import NAME_VARIABLE
-from avp_habitat.tracking.names import PARENT_TAG, existing_run, find_run
-from avp_habitat.tracking.opening import NewRun, join_run, start_run
-from avp_habitat.tracking.run import TrackedRun
+from avp_habitat.tracking.experiments import NAME_VARIABLE, existing_run, find_run
+from avp_habitat.tracking.names import KIND_TAG, METHOD_TAG, PARENT_TAG, POLICY_TAG, SCENE_TAG
+from avp_habitat.tracking.run import NewRun, TrackedRun, join_run, start_run
 from avp_habitat.tracking.stores import DEFAULT_ADDRESS, absolute, connect
 
 EXPERIMENT = "avp-experiment"
 """MLflow experiment outside of `mlflow run` where `MLFLOW_EXPERIMENT_NAME` names none."""
-KIND_TAG, KIND = "avp.kind", "experiment"
+KIND = "experiment"
 _ARTIFACTS = ("*.md", "*.csv", "*.png", "results.json", "experiment.json")
 _NOT_LOGGED = ("return_", "visibility_", "redundant_", "surface")
 """How figures of an episode begin that only `results.json` keeps."""

@@ -11,6 +11,7 @@ import gymnasium
 
 if TYPE_CHECKING:
     from avp_habitat.collect import Collect
+    from avp_habitat.metrics import Figure, metric
     from avp_habitat.navigation.area import NavigableArea
     from avp_habitat.policies.registry import make_policy
     from avp_habitat.poses import pixel_directions
@@ -25,12 +26,14 @@ if TYPE_CHECKING:
     from avp_habitat.task.observations import Agents, numbers
     from avp_habitat.task.rewards import RewardConstants, StepFacts, reward
     from avp_habitat.task.settings import TaskSettings
+    from avp_habitat.task.trajectory import Trajectory
 
 __all__ = [
     "AVPEnv",
     "AgentView",
     "Agents",
     "Collect",
+    "Figure",
     "Frame",
     "Frames",
     "NavigableArea",
@@ -41,9 +44,11 @@ __all__ = [
     "SingleRays",
     "StepFacts",
     "TaskSettings",
+    "Trajectory",
     "agent_views",
     "make_policy",
     "make_simulator",
+    "metric",
     "numbers",
     "pixel_directions",
     "read_rollout",
@@ -56,6 +61,7 @@ _HOME = {
     "AgentView": "task.agent_view",
     "Agents": "task.observations",
     "Collect": "collect",
+    "Figure": "metrics",
     "Frame": "scenes.location",
     "Frames": "simulators.base",
     "NavigableArea": "navigation.area",
@@ -66,9 +72,11 @@ _HOME = {
     "SingleRays": "simulators.base",
     "StepFacts": "task.rewards",
     "TaskSettings": "task.settings",
+    "Trajectory": "task.trajectory",
     "agent_views": "task.agent_view",
     "make_policy": "policies.registry",
     "make_simulator": "simulators.registry",
+    "metric": "metrics",
     "numbers": "task.observations",
     "pixel_directions": "poses",
     "read_rollout": "rollout.format",

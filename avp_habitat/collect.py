@@ -14,6 +14,7 @@ from avp_habitat.command import progress
 from avp_habitat.errors import RolloutError
 from avp_habitat.files import check_writable
 from avp_habitat.gpu import nerfacto_line
+from avp_habitat.metrics import METRICS_HELP
 from avp_habitat.policies.registry import (
     POLICY_NAMES,
     TRUSTED,
@@ -31,9 +32,8 @@ from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.task.rewards import REWARD_NAMES
 from avp_habitat.task.settings import TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
-from avp_habitat.tracking.names import open_store
 from avp_habitat.tracking.rollout_run import command_for, rollout_run
-from avp_habitat.tracking.stores import TrackingError, about_run, address_of, shown
+from avp_habitat.tracking.stores import TrackingError, about_run, address_of, open_store, shown
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,7 @@ class Collect:
     """Which simulator opens the scene."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """Of the start and of policies that draw at random."""
+    metrics: Annotated[tuple[str, ...], arg(help=METRICS_HELP)] = ()
     budget: int = 80
     """Steps, which are views."""
     width: Annotated[int, Range(8, 8192)] = 640
@@ -78,6 +79,10 @@ class Collect:
         return Intrinsics.from_hfov(self.width, self.height, hfov_deg=TaskSettings.hfov_deg)
 
 
+def _settings(options: Collect) -> TaskSettings:
+    return TaskSettings(reward=options.reward, budget=options.budget, metrics=options.metrics)
+
+
 def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: int = VIEWS) -> dict[str, Any]:
     """Collect one rollout.
 
@@ -94,7 +99,7 @@ def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: 
         AVPError: the scene, the simulator, the policy or the disk cannot be used; nothing is left behind.
     """
     check_policy(options.policy)
-    settings = settings or TaskSettings(reward=options.reward, budget=options.budget)
+    settings = settings or _settings(options)
     with RolloutWriter(options.out, options.camera) as writer:
         simulator = open_simulator(options.simulator, options.scene)
         env, policy = make_policy_env(options.policy, simulator, settings, seed=options.seed, trusted=options.trusted)
@@ -131,7 +136,7 @@ def _track(out: Path, option: str, experiment: str | None) -> None:
 
 def main(options: Collect) -> None:
     """Collect one rollout; print its figures and what to run next."""
-    TaskSettings(reward=options.reward, budget=options.budget)
+    _settings(options)
     check_policy(options.policy)
     check_writable(options.out, failure=RolloutError)
     print(f"opening {options.scene} for {described(options.policy)} …", flush=True)

@@ -58,7 +58,7 @@ def write_distribution(folder, name, groups, files=()):
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\n")
     lines = [[f"[{group}]", *(f"{key} = {value}" for key, value in each.items())] for group, each in groups.items()]
-    (info / "entry_points.txt").write_text("\n".join(sum(lines, [])))
+    (info / "entry_points.txt").write_text("\n".join(line for each in lines for line in each))
 
 
 @pytest.fixture(scope="module")
@@ -282,7 +282,7 @@ def test_surface_maps_have_to_be_declared():
         def __call__(self, agents):
             return agents.surface_maps()
 
-    with pytest.raises(UsageError, match="surface_maps: .* needs_surface = True"):
+    with pytest.raises(UsageError, match=r"surface_maps: .* needs_surface = True"):
         AVPEnv(simulator=Corridor(), observation=Undeclared(), **SMALL).reset(seed=0)
     Undeclared.needs_surface = True
     assert AVPEnv(simulator=Corridor(), observation=Undeclared(), **SMALL).reset(seed=0)[0].shape == (8, 10, 10)

@@ -18,6 +18,7 @@ MAY_IMPORT = {
 LIGHT = (
     "errors",
     "metrics",
+    "plugins",
     "poses",
     "ranges",
     "rollout.format",

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from avp_habitat.errors import SceneError, UsageError
-from avp_habitat.scenes import replica
 from avp_habitat.scenes.stage_config import (
     STAGE_CONFIG,
     Y_UP,
@@ -20,6 +19,7 @@ from avp_habitat.scenes.stage_config import (
     inside,
     read_config,
     read_stage,
+    replica_scene,
     shown,
 )
 
@@ -46,7 +46,7 @@ class Entry:
     @property
     def name(self) -> str:
         """The handle without folders and the ending of configs; of a stage of Replica the name of its scene."""
-        scene = None if self.file is None else replica.scene_folder(self.file)
+        scene = None if self.file is None else replica_scene(self.file)
         return self.words.rpartition("/")[2] if scene is None else scene.name
 
 
@@ -194,7 +194,7 @@ class SceneDataset:
             if config.name.endswith(STAGE_CONFIG):
                 layers.append(Layer(read_config(config), config))
                 files = (config,)
-                axes = Y_UP if replica.scene_folder(config) is None else Z_UP
+                axes = Y_UP if replica_scene(config) is None else Z_UP
             else:
                 layers.append(Layer({"render_asset": config.name}, self.path, "stages.paths."))
                 # Without a config, Habitat-Sim judges by the name, unless the dataset has defaults for its stages.

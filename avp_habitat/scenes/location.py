@@ -6,9 +6,20 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from avp_habitat.errors import AVPError, SceneError, UsageError
-from avp_habitat.scenes import replica
+from avp_habitat.scenes.dataset import SceneDataset
 from avp_habitat.scenes.files import SUFFIXES, broken_link
-from avp_habitat.scenes.stage_config import STAGE_CONFIG, Y_UP, Z_UP, Layer, Vector, read_config, read_stage
+from avp_habitat.scenes.stage_config import (
+    REPLICA_MESH,
+    STAGE_CONFIG,
+    Y_UP,
+    Z_UP,
+    Layer,
+    Vector,
+    is_replica_scene,
+    read_config,
+    read_stage,
+    replica_scene,
+)
 
 BUILTIN = "builtin:"
 UPS = ("y", "z")
@@ -102,37 +113,34 @@ def _seed(spec: str) -> int:
 
 
 def _mesh(path: Path) -> SceneLocation:
-    scene = replica.scene_folder(path)
+    scene = replica_scene(path)
     return SceneLocation(path.name, path) if scene is None else SceneLocation(scene.name, path, *Z_UP)
+
+
+def _replica_scenes(folder: Path) -> list[str]:
+    """Names of the scenes in a folder that holds Replica, sorted."""
+    return sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and is_replica_scene(entry))
 
 
 def _mesh_of(folder: Path) -> Path:
     """The mesh that is shown of a scene folder of Replica."""
-    if replica.is_scene(Path(os.path.abspath(folder))):
-        return folder / replica.MESH
-    scenes = replica.scenes_within(folder)
+    if is_replica_scene(Path(os.path.abspath(folder))):
+        return folder / REPLICA_MESH
+    scenes = _replica_scenes(folder)
     hint = f"; name one of its {len(scenes)} scenes, {folder / scenes[0]} say" if scenes else ""
     raise SceneError(f"{folder}: expected a scene file, found a folder that is no scene of Replica{hint}")
 
 
 def _stage(path: Path) -> SceneLocation:
     _expect_file(path, (STAGE_CONFIG,))
-    scene = replica.scene_folder(path)
-    name = path.name.removesuffix(STAGE_CONFIG)
+    scene, name = replica_scene(path), path.name.removesuffix(STAGE_CONFIG)
     # Replica's stage config lies in habitat/ and shows ../mesh.ply, so the folder above is part of the data.
-    stage = read_stage(
-        [Layer(read_config(path), path)],
-        path.parent,
-        Path(os.path.abspath(path)).parents[1],
-        name=name,
-        axes=Y_UP if scene is None else Z_UP,
-    )
+    root, axes = Path(os.path.abspath(path)).parents[1], Y_UP if scene is None else Z_UP
+    stage = read_stage([Layer(read_config(path), path)], path.parent, root, name=name, axes=axes)
     return SceneLocation(name if scene is None else scene.name, stage.asset, *stage.axes, files=(path,))
 
 
 def _in_dataset(path: Path, scene_id: str) -> SceneLocation:
-    from avp_habitat.scenes.dataset import SceneDataset
-
     _expect_file(path, (DATASET_CONFIG,))
     found = SceneDataset(path).scene(scene_id)
     return SceneLocation(
@@ -147,7 +155,7 @@ def _in_dataset(path: Path, scene_id: str) -> SceneLocation:
 
 
 def _unknown(path: Path) -> AVPError:
-    folders = replica.scenes_within(path.parent) if path.parent.is_dir() else []
+    folders = _replica_scenes(path.parent) if path.parent.is_dir() else []
     near = difflib.get_close_matches(path.name, folders, n=2, cutoff=0.5)
     if near:
         return SceneError(f"{path}: no such folder; did you mean {' or '.join(near)}?")

@@ -1,7 +1,17 @@
-"""Habitat-Sim's stage configs: the mesh that a stage shows, and the axes of that mesh.
+"""Habitat-Sim's stage configs and Replica's folders: the mesh that is shown, and the axes of that mesh.
 
 What a config means is followed, for every kind of mesh. Version 0.3.4 itself turns a `.glb` so, but shows a `.ply` or
 `.obj` as it lies, whatever its axes, and without vertex colours (ResourceManager::loadRenderAssetGeneral).
+
+A scene of Replica lies on disk like this (github.com/facebookresearch/Replica-Dataset, README.md):
+
+    replica.scene_dataset_config.json           room_0/habitat/mesh_semantic.ply    quads with an object_id per face
+    room_0/mesh.ply   quads, vertex colours     room_0/habitat/info_semantic.json
+    room_0/textures/  (PTex, not shown here)    room_0/habitat/replica_stage.stage_config.json
+
+Both meshes are Z-up (github.com/facebookresearch/habitat-sim, issue 2631). The stage config says nothing of that: its
+keys are render_asset (`../mesh.ply`), semantic_asset, semantic_descriptor_filename and nav_asset (as quoted in
+github.com/facebookresearch/sound-spaces, issue 143); the axes stand in the dataset config's defaults for stages.
 """
 
 import json
@@ -26,6 +36,9 @@ render asset is a `.glb` too: only an asset without any config is taken for Z-up
 """
 Z_UP: Axes = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
 """Up and front of Replica, Matterport3D and HM3D."""
+REPLICA_MESH = "mesh.ply"
+_REPLICA_FILES = ("mesh_semantic.ply", "info_semantic.json", "replica_stage.stage_config.json")
+_HABITAT = "habitat"
 _FILE_NAME_TAG = "%%CONFIG_NAME_AS_ASSET_FILENAME%%"
 _NEUTRAL = {"origin": [0, 0, 0], "scale": [1, 1, 1], "units_to_meters": 1}
 
@@ -44,20 +57,34 @@ class Layer:
 
 @dataclass(frozen=True)
 class Stage:
-    """What a stage shows."""
+    """What a stage shows: a mesh file that exists, and unit vectors up and front in it, at right angles."""
 
     asset: Path
-    """The mesh file; it exists."""
     axes: Axes
-    """Unit vectors up and front in the asset's coordinates, at right angles."""
+
+
+def replica_scene(path: Path) -> Path | None:
+    """The folder of the scene that a mesh or stage config of Replica belongs to, None for any other file.
+
+    Args:
+        path: `room_0/mesh.ply`, `room_0/habitat/mesh_semantic.ply` or the stage config beside it.
+    """
+    folder = Path(os.path.abspath(path)).parent
+    if path.name in (_REPLICA_FILES[0], _REPLICA_FILES[2]) and folder.name == _HABITAT:
+        folder = folder.parent
+    elif path.name != REPLICA_MESH:
+        return None
+    return folder if is_replica_scene(folder) else None
+
+
+def is_replica_scene(folder: Path) -> bool:
+    """Whether a folder has `habitat/` with at least two of Replica's files in it, or one of them and `mesh.ply`."""
+    count = sum((folder / _HABITAT / name).is_file() for name in _REPLICA_FILES)
+    return count > 0 and count + (folder / REPLICA_MESH).is_file() > 1
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """The object that a JSON file holds.
-
-    Raises:
-        SceneError: the file cannot be read, or holds something else.
-    """
+    """The object that a JSON file holds; SceneError where it cannot be read, or holds something else."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -100,18 +127,10 @@ def find(layers: Sequence[Layer], key: str) -> tuple[Any, Layer]:
 
 
 def expect_neutral(layers: Sequence[Layer], key: str, *neutral: Any) -> None:
-    """Refuse an attribute that moves, turns or scales a stage.
+    """Refuse, by a SceneError, an attribute that moves, turns or scales a stage: all but the `neutral` values.
 
     Habitat-Sim 0.3.4 reads origin, units_to_meters and the stage's place in a scene instance without using them, and
     scales what is seen but not the NavMesh; older versions do not scale. No two simulators would show the same scene.
-
-    Args:
-        layers: the attributes.
-        key: of the one attribute.
-        neutral: values that change nothing.
-
-    Raises:
-        SceneError: the attribute is there and is not neutral.
     """
     value, layer = find(layers, key)
     if value is None or value in neutral:
@@ -123,12 +142,9 @@ def expect_neutral(layers: Sequence[Layer], key: str, *neutral: Any) -> None:
 
 
 def inside(target: Path, root: Path, told_by: str, value: str) -> Path:
-    """The same path without `..`, when it does not leave the data set.
+    """The same path without `..`; SceneError where it leaves the data set's folder.
 
-    Absolute paths are judged by the same rule. What counts is the path as it is written: links may lead anywhere.
-
-    Raises:
-        SceneError: it lies outside of `root`.
+    What counts is the path as it is written: links may lead anywhere.
     """
     # No file system takes the null character, and asking about one is an error of its own.
     if "\0" in value or not Path(os.path.abspath(target)).is_relative_to(os.path.abspath(root)):

@@ -34,8 +34,6 @@ class AVPEnv(gymnasium.Env[Observed, np.int64]):
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 4}  # noqa: RUF012 - gymnasium's own declaration
-    failure = None
-    """Why there is no scene; that of a `worker_env.UnopenedEnv` says it."""
 
     def __init__(
         self,
@@ -236,7 +234,7 @@ def step_info(task: ViewpointTask, outcome: StepOutcome) -> list[dict[str, Any]]
     for row in np.flatnonzero(outcome.terminated | outcome.truncated):
         stopped = bool(outcome.terminated[row])
         trajectory = task.trajectory(int(row))
-        infos[row]["avp_episode"] = episode_metrics(trajectory, stopped=stopped)
+        infos[row]["avp_episode"] = episode_metrics(trajectory, stopped=stopped, further=task.settings.metrics)
         infos[row]["avp_trajectory"] = trajectory
         infos[row]["is_success"] = stopped
     return infos

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 from avp_habitat import plugins
 from avp_habitat.errors import UsageError
+from avp_habitat.metrics import find_metrics
 from avp_habitat.poses import Intrinsics
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.task.rewards import RewardConstants, RewardFunction, find_reward, needs_surface
@@ -60,6 +61,9 @@ class TaskSettings:
     """numbers: the twelve of the design. map: these, whether C ≥ τ, and a map of what was seen of the floor around the
     agent. surface_map: these, and maps of what was seen of walls, furniture and ceiling. Or `module:object`, another
     distribution's, or the object itself (`observations.Observation`)."""
+    metrics: tuple[Any, ...] = ()
+    """Further metrics, of episodes and of rollouts: `module:function`, another distribution's, or the functions
+    themselves (`metrics.metric`). Their values stand beside the suite's own wherever these are logged."""
     lookup: bool = False
     """Whether views are looked up in tables of the scene instead of casting all their rays: faster, for training."""
 
@@ -69,6 +73,9 @@ class TaskSettings:
         if self.observation not in OBSERVATIONS:  # Those are imported by who makes one.
             plugins.find("avp.observations", self.observation, OBSERVATIONS)
         hold_ranges(self)
+        metrics = (self.metrics,) if isinstance(self.metrics, str) else tuple(self.metrics)
+        object.__setattr__(self, "metrics", metrics)
+        find_metrics(metrics)
         if self.collision_m >= self.forward_m:
             raise UsageError(
                 f"collision_m: expected less than forward_m ({self.forward_m:g}), or every move is a collision, got "
@@ -84,7 +91,9 @@ class TaskSettings:
     def facts(self) -> dict[str, Any]:
         """All fields as they are stored as text: objects by their names."""
         named = {"reward": plugins.name_of(self.reward), "observation": plugins.name_of(self.observation)}
-        plain = {each.name: getattr(self, each.name) for each in fields(self)}
+        plain = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "metrics"}
+        if self.metrics:
+            named["metrics"] = ", ".join(map(plugins.name_of, self.metrics))
         return plain | {"constants": asdict(self.constants)} | named
 
     @property

@@ -18,7 +18,7 @@ from avp_habitat.scenes.location import UPS, locate
 from avp_nerfstudio.check.outputs import choose_folder, outputs_of_geometry, write_outputs
 from avp_nerfstudio.check.shape import check_format
 from avp_nerfstudio.check.verdict import Verdict
-from avp_nerfstudio.data.foreign import check_is_rollout
+from avp_nerfstudio.data.refusals import check_is_rollout
 
 
 class CheckFailedError(AVPError):

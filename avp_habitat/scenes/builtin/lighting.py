@@ -1,19 +1,17 @@
 """Light baked into vertices: daylight, lamps with soft shadows, darkening where surfaces meet."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.scenes.builtin.kit import Lamp
-from avp_habitat.scenes.builtin.shapes import Surface
+from avp_habitat.scenes.builtin.shapes import Float, Surface
 from avp_habitat.scenes.builtin.shell import Shell
-
-Float = NDArray[np.floating]
 
 VOXEL_M = 0.1
 PADDING = 8
 """Voxels around the room that count as solid."""
-
-
 _OFF_THE_GRID = 3.7e-5
 """Metres by which voxels are shifted, so that no wall lies exactly between two of them."""
 
@@ -22,12 +20,7 @@ class Voxels:
     """What of the room's space is filled, and how filled the surroundings of each place are."""
 
     def __init__(self, shell: Shell, surfaces: list[Surface]) -> None:
-        """Fill every voxel that a surface passes through and everything outside the room.
-
-        Args:
-            shell: the room.
-            surfaces: what stands in it.
-        """
+        """Fill every voxel that a surface passes through and everything outside the room."""
         x0, z0, x1, z1 = shell.bounds
         self._origin = np.array([x0, 0.0, z0]) - PADDING * VOXEL_M - _OFF_THE_GRID
         extent = np.array([x1 - x0, shell.ceiling, z1 - z0])
@@ -110,30 +103,20 @@ def _from_lamp(voxels: Voxels, points: Float, normals: Float, position: Float, r
     return (falloff * voxels.clear_view(points + normals * 1.6 * VOXEL_M, position)).astype(np.float32)
 
 
-def _windows(shell: Shell) -> list[tuple[Float, float]]:
+def _windows(shell: Shell) -> Iterator[tuple[Float, float]]:
     """Points of light just inside each window and their strength."""
-    made = []
     for hole in shell.openings:
-        if hole.kind != "window":
-            continue
-        wall, width = shell.walls[hole.wall], hole.right - hole.left
-        for share in (0.25, 0.75):
-            x, z = wall.point(hole.left + width * share, 0.3)
-            made.append((np.array([x, (hole.bottom + hole.top) / 2 + 0.2, z]), 0.3 * width))
-    return made
+        if hole.kind == "window":
+            wall, width = shell.walls[hole.wall], hole.right - hole.left
+            for share in (0.25, 0.75):
+                x, z = wall.point(hole.left + width * share, 0.3)
+                yield np.array([x, (hole.bottom + hole.top) / 2 + 0.2, z]), 0.3 * width
 
 
 def bake(shell: Shell, surfaces: list[Surface], lamps: list[Lamp]) -> list[NDArray[np.float32]]:
-    """`(v, 3)` colours in [0, 1] of each surface: tint times light.
-
-    Args:
-        shell: the room, whose windows give daylight.
-        surfaces: everything in the world frame.
-        lamps: in the world frame.
-    """
+    """`(v, 3)` light in [0, 1] on each surface, from windows and lamps; all is in the world frame."""
     voxels = Voxels(shell, surfaces)
-    points = np.concatenate([surface.vertices for surface in surfaces])
-    normals = np.concatenate([surface.normals for surface in surfaces])
+    points, normals = (np.concatenate([getattr(each, name) for each in surfaces]) for name in ("vertices", "normals"))
     openness = _open_sky(voxels, points, normals)
     ambient = openness * (0.76 + 0.05 * normals[:, 1]).astype(np.float32)
     light = ambient[:, None] * np.array([1.0, 0.99, 0.97], np.float32)
@@ -144,10 +127,7 @@ def bake(shell: Shell, surfaces: list[Surface], lamps: list[Lamp]) -> list[NDArr
         warm = _from_lamp(voxels, points, normals, np.asarray(lamp.position), 0.9) * np.float32(lamp.strength)
         light += warm[:, None] * np.array([1.05, 0.92, 0.7], np.float32)
     light = np.where(light > 0.8, 0.8 + (light - 0.8) * 0.45, light)
-    colours, start = [], 0
-    for surface in surfaces:
-        end = start + len(surface.vertices)
-        shown = np.ones((end - start, 3), np.float32) if surface.material.glows else light[start:end]
-        colours.append(np.clip(shown * np.asarray(surface.material.tint, np.float32), 0, 1))
-        start = end
-    return colours
+    parts = np.split(np.clip(light, 0, 1), np.cumsum([len(surface.vertices) for surface in surfaces])[:-1])
+    return [
+        np.ones_like(part) if surface.material.glows else part for surface, part in zip(surfaces, parts, strict=True)
+    ]

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import time
 import zipfile
-from pathlib import Path
 
 import pytest
 from mlflow import MlflowClient
@@ -19,17 +18,11 @@ from avp_sb3 import AVPVecEnv, MLflowCallback
 from avp_sb3.callbacks.best_model import save_model
 from avp_sb3.presets import TABLE_4
 
-ROOT = Path(__file__).resolve().parent.parent
-
 
 def run(*words, folder):
     """The training program as a user runs it; results go to `folder`."""
-    return _run("-m", "avp_sb3.train", *words, folder=folder)
-
-
-def _run(*words, folder):
     env = {**os.environ, "MLFLOW_TRACKING_URI": f"sqlite:///{folder / 'mlflow.db'}", "PYTHONWARNINGS": "ignore"}
-    line = [sys.executable, *map(str, words)]
+    line = [sys.executable, "-m", "avp_sb3.train", *map(str, words)]
     return subprocess.run(line, cwd=folder, env=env, capture_output=True, text=True, timeout=550, check=False)
 
 
@@ -64,14 +57,14 @@ def test_the_training_script_trains_tracks_and_saves(tmp_path):
     [
         (("--agents", 3), "--agents: expected a divisor of PPO's buffer of 2048 steps, got 3"),
         (("--reward", "cover"), "unknown reward 'cover'"),
-        (("--steps", 0), "--steps: expected at least 1, got 0"),
+        (("--steps", 0), "--steps: expected a whole number from 1 to 1e+12, got 0"),
         (
             ("--observation", "maps"),
             "unknown observation 'maps': expected one of map, numbers, surface_map; did you mean 'map'?",
         ),
         (("--resume", "no.zip"), "--resume no.zip: no such model file"),
         (("--resume", "runs:/1/model.zip"), "--resume runs:/1/model.zip: no MLflow database at sqlite:///"),
-        (("--eval-every", 0), "--eval-every: expected at least 1, got 0"),
+        (("--eval-every", 0), "--eval-every: expected a whole number from 1 to 1e+12, got 0"),
         (("--gpu", 0), "--gpu: is of the simulator 'habitat', but 'raycast' was chosen"),
         (("--workers", 0), "workers: expected 1 or a multiple of it, as there is 1 scene, got 0"),
     ],
