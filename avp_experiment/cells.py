@@ -35,11 +35,10 @@ class Cell:
     kind: str
     """`TRAIN`, `COLLECT` or `RECONSTRUCT`."""
     name: str
-    """Of its folder, unique within its kind."""
+    """Unique within its kind."""
     words: tuple[str, ...]
     """The command line, `python -m MODULE …`, which works alone too."""
     method: Method
-    """That takes the views."""
     seed: int
     """Of the training, and of the starts."""
     scene: Scene | None = None
@@ -49,7 +48,6 @@ class Cell:
     frames: int | None = None
     """A reconstruction from the first so many frames; None from all."""
     needs: "Cell | None" = None
-    """What must be done before."""
 
     @property
     def key(self) -> str:
@@ -71,13 +69,7 @@ class Cell:
 
 
 def plan(configuration: Configuration, root: Path, *, tracking: str) -> list[Cell]:
-    """All cells; each stands after the one that it needs.
-
-    Args:
-        configuration: of the experiment.
-        root: its folder.
-        tracking: MLflow experiment of the trainings.
-    """
+    """All cells, each after the one that it needs; trainings are logged to the MLflow experiment `tracking`."""
     planner = _Planner(configuration, root, tracking)
     cells: list[Cell] = []
     for seed in range(configuration.preset.seeds):
@@ -154,7 +146,6 @@ def facts_of(cell: Cell, root: Path) -> dict[str, Any]:
 
 
 def _of_training(path: Path) -> dict[str, Any]:
-    """Steps, MLflow run, and the curves that the run holds."""
     from mlflow import MlflowClient
 
     from avp_habitat.policies.registry import load_model
@@ -203,14 +194,8 @@ def _steps(folder: Path) -> list[dict[str, str]]:
 def floor_map(folder: Path) -> dict[str, Any] | None:
     """The map of a rollout as `results.json` keeps it, with `[x, z, yaw]` after each step in metres and radians.
 
-    Args:
-        folder: of the rollout.
-
     Returns:
         None for a rollout that was written without its floor.
-
-    Raises:
-        RolloutError: the folder or its floor cannot be read.
     """
     from avp_habitat.rollout.format import read_rollout
     from avp_habitat.rollout.images import read_numbers

@@ -4,20 +4,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from avp_experiment import statistics
 from avp_experiment.configuration import ROOMS, TRAIN, UNSEEN
 from avp_experiment.results import Key, Results
-from avp_experiment.statistics import (
-    PREDICTORS,
-    Summary,
-    at_views,
-    correlations,
-    figure_named,
-    paired,
-    points_of,
-    saved_share,
-    summary,
-    views_to_reach,
-)
+from avp_experiment.statistics import PREDICTORS, Summary
 from avp_experiment.tables import NOTHING
 from avp_habitat.tables import table
 
@@ -56,13 +46,13 @@ def _failures(results: Results) -> list[str]:
 
 def _heuristic(results: Results) -> list[str]:
     # By the trainings that are there; a training that failed has no episodes to compare.
-    trained = {one.method for one in results.trainings}
+    trained = {one.method for one in results.training}
     names = ("coverage", "psnr")
     lines = []
     for role, where in _WHERE.items():
         base = {name: results.values("heuristic", role, name) for name in names}
         found = {
-            method: [paired(results.values(method, role, name), base[name]) for name in names]
+            method: [statistics.paired(results.values(method, role, name), base[name]) for name in names]
             for method in results.methods
             if method in trained
         }
@@ -86,7 +76,7 @@ def _below(found: Sequence[Sequence[Summary | None]]) -> str:
     both = "coverage and PSNR" if any(psnr for _, psnr in found) else "coverage"
     if any(one.mean <= 0 for one in differences):
         return f"**not** below every learned policy in {both}{missing}"
-    if all(one.low > 0 for one in differences):
+    if all(one.interval[0] > 0 for one in differences):
         return f"clearly below every learned policy in {both}: no interval reaches 0{missing}"
     return f"below every learned policy in {both} on average, but not every difference has an interval above 0{missing}"
 
@@ -97,7 +87,7 @@ def _fewer_views(results: Results) -> list[str]:
         views, psnr = (
             [results.values(method, role, name) for method in ("proposed", "coverage")] for name in ("views", "psnr")
         )
-        saved, difference, where = saved_share(*views), paired(*psnr), where.capitalize()
+        saved, difference, where = statistics.saved_share(*views), statistics.paired(*psnr), where.capitalize()
         if saved is None or difference is None:
             missing = "episodes" if saved is None else "reconstructions"
             lines.append(f"{where}: cannot be said, `proposed` and `coverage` have no {missing} in common.")
@@ -116,7 +106,7 @@ def _holds(saved: Summary, difference: Summary) -> str:
         return "**does not hold** (by the means)."
     if np.isnan(saved.half_width):
         return "**holds** (one seed: no interval)."
-    if saved.low >= FEWER_VIEWS and difference.low >= -WORSE_DB:
+    if saved.interval[0] >= FEWER_VIEWS and difference.interval[0] >= -WORSE_DB:
         return "**holds**, also at the unfavourable ends of both intervals."
     return "**holds** by the means, not over the whole intervals."
 
@@ -146,13 +136,13 @@ def _compared(results: Results, left: str, right: str, role: str) -> list[str]:
     # A number of views that only some episodes reach compares others than the rest of the table does.
     for views in sorted(set.intersection(*(set(curve) for curve in (*first.values(), *second.values())))):
         both = [{key: curve[views] for key, curve in curves.items()} for curves in (first, second)]
-        rows.append([str(views), _difference(paired(*both), "psnr"), str(len(common))])
+        rows.append([str(views), _difference(statistics.paired(*both), "psnr"), str(len(common))])
     shorter = {key: min(max(first[key]), max(second[key])) for key in common}
     both = [
-        {key: psnr for key, curve in curves.items() if (psnr := at_views(curve, shorter[key])) is not None}
+        {key: psnr for key, curve in curves.items() if (psnr := statistics.at_views(curve, shorter[key])) is not None}
         for curves in (first, second)
     ]
-    difference = paired(*both)
+    difference = statistics.paired(*both)
     rows.append(["the shorter episode's", _difference(difference, "psnr"), str(len(set.intersection(*map(set, both))))])
     said = _equal_views(difference) if difference else "no common range of views."
     return [
@@ -178,9 +168,9 @@ def _equal_views(difference: Summary) -> str:
     higher = "higher" if difference.mean > 0 else "not higher"
     if np.isnan(difference.half_width):
         return f"{shown}, {higher} (one seed: no interval)."
-    if difference.low > 0:
+    if difference.interval[0] > 0:
         return f"{shown}: higher, the whole interval too."
-    if difference.high < 0:
+    if difference.interval[1] < 0:
         return f"{shown}: lower, the whole interval too."
     return f"{shown}: {higher} on average, but the interval holds 0."
 
@@ -188,7 +178,7 @@ def _equal_views(difference: Summary) -> str:
 def _equal_psnr(left: Curves, right: Curves, name: str, other: str) -> str:
     """How many views the left method needs for the final PSNR of the right one."""
     taken = {key: float(max(curve)) for key, curve in right.items()}
-    needed = {key: views_to_reach(curve, right[key][max(right[key])]) for key, curve in left.items()}
+    needed = {key: statistics.views_to_reach(curve, right[key][max(right[key])]) for key, curve in left.items()}
     reached = {key: views for key, views in needed.items() if views is not None}
     head = f"The final PSNR of `{other}` is reached by `{name}`"
     if not reached:
@@ -200,13 +190,13 @@ def _equal_psnr(left: Curves, right: Curves, name: str, other: str) -> str:
     note = f" (in {least} already at the fewest views measured, so that it may need fewer still)" if least else ""
     return (
         f"{head} after {_mean(reached)} views where `{other}` took {_mean(have)}: "
-        f"{_difference(paired(have, reached), 'views')} views saved{note}."
+        f"{_difference(statistics.paired(have, reached), 'views')} views saved{note}."
     )
 
 
 def _prediction(results: Results) -> list[str]:
-    points = points_of(results)
-    found = {name: correlations(points, name) for name in PREDICTORS}
+    points = statistics.points_of(results)
+    found = {name: statistics.correlations(points, name) for name in PREDICTORS}
     seen = found["visibility"]
     overall, whole = seen["all"], seen["whole episodes"]
     if overall is None:
@@ -232,7 +222,7 @@ def _transfer(results: Results) -> list[str]:
     for method in results.methods:
         # The scenes differ, so only seed and start pair them.
         both = [[_over_scenes(results.values(method, role, name)) for role in (UNSEEN, TRAIN)] for name in names]
-        cells = [_difference(paired(*values), name) for values, name in zip(both, names, strict=True)]
+        cells = [_difference(statistics.paired(*values), name) for values, name in zip(both, names, strict=True)]
         if set(cells) != {NOTHING}:
             rows.append([method, *cells])
     if not rows:
@@ -254,7 +244,7 @@ def _over_scenes(values: Mapping[Key, float]) -> dict[Key, float]:
 
 def _heading(name: str) -> str:
     """Of a column of differences: those of percentages are in points."""
-    figure = figure_named(name)
+    figure = statistics.figure_named(name)
     return f"{figure.title} [points]" if figure.unit == "%" else figure.heading
 
 
@@ -263,5 +253,5 @@ def _difference(found: Summary | None, name: str) -> str:
 
 
 def _mean(views: Mapping[Key, float]) -> str:
-    found = summary(views)
+    found = statistics.summary(views)
     return found.text("views") if found else NOTHING

@@ -68,7 +68,7 @@ class Compare:
 
     @property
     def line(self) -> str:
-        """The command line as the user would type it."""
+        """The command line as a user types it."""
         given = {field.name: (getattr(self, field.name), field.default) for field in fields(self)}
         chosen = {name: str(value) for name, (value, default) in given.items() if value != default}
         if os.environ.get("MLFLOW_RUN_ID"):
@@ -100,8 +100,7 @@ def compare(configuration: Configuration, out: Path, *, jobs: int, line: str) ->
         line: the command, for the results and for going on after an interruption.
 
     Raises:
-        UsageError: the folder holds something else, or another program works there.
-        AVPError: nothing could be done, or some cells failed; the others are done then.
+        AVPError: the folder cannot be used, or some cells failed; the others are done then.
     """
     from avp_experiment.report import write_report
     from avp_experiment.results import gather

@@ -131,7 +131,6 @@ class Scene:
     name: str
     """Without folders."""
     sha256: str
-    """Of its content."""
     role: str
     """`TRAIN` or `UNSEEN`."""
 
@@ -146,15 +145,12 @@ class Configuration:
     """An experiment."""
 
     preset_name: str
-    """Of the preset."""
     preset: Preset
     """Its values, some of them perhaps replaced by the user."""
     scenes: tuple[Scene, ...]
     """Of training first, then unseen ones."""
     methods: tuple[Method, ...]
-    """Compared."""
     simulator: str = "raycast"
-    """The simulator's name."""
     up: str | None = None
     """Axis of mesh files that points up; the scenes' digests cover it."""
 
@@ -197,15 +193,10 @@ def read_scenes(train: Sequence[str], unseen: Sequence[str], choice: SimulatorCh
             scene = Scene(spec, opened.scene, opened.scene_digest, role)
             opened.close()
             for other in found:
-                _check_different(scene, other)
+                if scene.sha256 == other.sha256:
+                    same = f"the same scene as {other.spec}, given as {other.role}; expected each scene once"
+                    raise UsageError(f"{spec}: {same}")
+                if scene_slug(scene.name) == scene_slug(other.name):
+                    raise UsageError(f"{spec}: has the same name as {other.spec}; expected scenes of different names")
             found.append(scene)
     return tuple(found)
-
-
-def _check_different(scene: Scene, other: Scene) -> None:
-    if scene.sha256 == other.sha256:
-        raise UsageError(
-            f"{scene.spec}: the same scene as {other.spec}, given as {other.role}; expected each scene once"
-        )
-    if scene_slug(scene.name) == scene_slug(other.name):
-        raise UsageError(f"{scene.spec}: has the same name as {other.spec}; expected scenes of different names")

@@ -23,7 +23,7 @@ _MB = 1 << 20
 
 @dataclass(frozen=True)
 class Folder:
-    """An experiment's folder."""
+    """What is done, what failed and what is left."""
 
     root: Path
 
@@ -174,4 +174,4 @@ def _bytes_needed(cells: Sequence[Cell], configuration: Configuration) -> int:
 
 
 def _size(count: int) -> str:
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
+    return f"{count / 1e6:,.0f} MB"

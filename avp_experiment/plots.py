@@ -44,40 +44,27 @@ class Drawn:
         Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
-@dataclass(frozen=True)
-class Style:
-    """Colour, marker and line of one method, the same in all pictures."""
-
-    colour: str
-    marker: str
-    line: str = "-"
-    """Dashed where it was trained in generated rooms."""
-    filled: bool = True
-    """Whether its points are; hollow where it was trained in generated rooms."""
-
-
 # Colours of Okabe and Ito (https://jfly.uni-koeln.de/color/), which people with colour blindness can tell apart, with a
 # dark purple and greys beside them; markers differ too.
 _STYLES = {
-    "heuristic": Style("#000000", "X"),
-    "random": Style("#8C8C8C", "v"),
-    "spin": Style("#BBBBBB", "<"),
-    "survey": Style("#5F5F5F", ">"),
-    "frontier": Style("#E69F00", "s"),
-    "greedy": Style("#CC79A7", "D"),
-    "oracle": Style("#009E73", "P"),
-    "coverage": Style("#56B4E9", "^"),
-    "coverage_redundancy": Style("#0072B2", "p"),
-    "proposed": Style("#D55E00", "o"),
-    "surface": Style("#661F77", "h"),
+    "heuristic": ("#000000", "X"),
+    "random": ("#8C8C8C", "v"),
+    "spin": ("#BBBBBB", "<"),
+    "survey": ("#5F5F5F", ">"),
+    "frontier": ("#E69F00", "s"),
+    "greedy": ("#CC79A7", "D"),
+    "oracle": ("#009E73", "P"),
+    "coverage": ("#56B4E9", "^"),
+    "coverage_redundancy": ("#0072B2", "p"),
+    "proposed": ("#D55E00", "o"),
+    "surface": ("#661F77", "h"),
 }
-_OTHER = Style("#A08060", "8")
+_OTHER = ("#A08060", "8")
 
 
-def style_of(method: str) -> Style:
-    """The style of a method; one trained in generated rooms has its reward's colour, dashed and hollow."""
-    found = _STYLES.get(method.removesuffix(ROOMS), _OTHER)
-    return Style(found.colour, found.marker, "--", filled=False) if method.endswith(ROOMS) else found
+def style_of(method: str) -> tuple[str, str, str]:
+    """Colour, marker and line of a method; of one trained in generated rooms its reward's, dashed."""
+    return *_STYLES.get(method.removesuffix(ROOMS), _OTHER), "--" if method.endswith(ROOMS) else "-"
 
 
 def new_figure(height_in: float) -> "Figure":
@@ -173,7 +160,7 @@ def visibility_and_psnr(results: Results) -> Drawn:
 
 def _trained(results: Results, metric: str) -> dict[str, list[Training]]:
     """By method in the tables' order: the trainings that have a curve."""
-    having = [one for one in results.trainings if len(one.curves.get(metric, [])) > 1]
+    having = [one for one in results.training if len(one.curves.get(metric, [])) > 1]
     if not having:
         raise Missing(f"no training has a curve of {metric}")
     found = {method: [one for one in having if one.method == method] for method in results.methods}
@@ -191,11 +178,11 @@ def _training_curve(axes: "Axes", method: str, trainings: Sequence[Training], me
     curves = [one.curves[metric] for one in trainings]
     steps = np.linspace(max(curve[0, 0] for curve in curves), min(curve[-1, 0] for curve in curves), 200)
     values = np.array([np.interp(steps, curve[:, 0], curve[:, 1]) for curve in curves])
-    style = style_of(method)
-    axes.plot(steps / _MILLION, values.mean(axis=0), style.line, color=style.colour, label=method, linewidth=1.8)
+    colour, _, line = style_of(method)
+    axes.plot(steps / _MILLION, values.mean(axis=0), line, color=colour, label=method, linewidth=1.8)
     if len(values) > 1:
         low, high = values.min(axis=0), values.max(axis=0)
-        axes.fill_between(steps / _MILLION, low, high, color=style.colour, alpha=0.18, linewidth=0)
+        axes.fill_between(steps / _MILLION, low, high, color=colour, alpha=0.18, linewidth=0)
 
 
 def _psnr_points(results: Results, method: str, role: str) -> list[tuple[float, dict[Key, float]]]:
@@ -219,20 +206,12 @@ def _psnr_curve(axes: "Axes", method: str, points: Sequence[tuple[float, dict[Ke
     if not found:
         return
     halves = np.array([one.half_width for one in found.values()])
-    style = style_of(method)
-    bars = axes.errorbar(
-        list(found),
-        [one.mean for one in found.values()],
-        yerr=None if np.isnan(halves).all() else np.nan_to_num(halves),
-        fmt=style.marker + style.line,
-        color=style.colour,
-        label=method,
-        linewidth=1.6,
-        elinewidth=0.8,
-        markerfacecolor=style.colour if style.filled else "white",
-        markersize=5.5,
-    )
-    for bar in bars[2]:
+    colour, marker, line = style_of(method)
+    look: dict[str, Any] = {"color": colour, "linewidth": 1.6, "elinewidth": 0.8, "markersize": 5.5, "label": method}
+    look["markerfacecolor"] = colour if line == "-" else "white"
+    spread = None if np.isnan(halves).all() else np.nan_to_num(halves)
+    means = [one.mean for one in found.values()]
+    for bar in axes.errorbar(list(found), means, yerr=spread, fmt=marker + line, **look)[2]:
         bar.set_alpha(0.45)
 
 
@@ -241,18 +220,12 @@ def _scatter(axes: "Axes", points: Sequence[Point], name: str) -> None:
         chosen = [point for point in points if point.whole is whole]
         if not chosen:
             continue
-        style = style_of(chosen[0].method)
-        axes.scatter(
-            [figure_named(name).scale * point.shares[name] for point in chosen],
-            [point.psnr for point in chosen],
-            s=46 if whole else 16,
-            marker=style.marker,
-            facecolors=style.colour if style.filled else "none",
-            edgecolors=style.colour,
-            alpha=0.9 if whole else 0.4,
-            linewidths=1.1,
-            label=chosen[0].method if whole or len(chosen) == len(points) else None,
-        )
+        colour, marker, line = style_of(chosen[0].method)
+        look = {"marker": marker, "edgecolors": colour, "facecolors": colour if line == "-" else "none"}
+        look |= {"s": 46, "alpha": 0.9} if whole else {"s": 16, "alpha": 0.4}
+        shares = [figure_named(name).scale * point.shares[name] for point in chosen]
+        label = chosen[0].method if whole or len(chosen) == len(points) else None
+        axes.scatter(shares, [point.psnr for point in chosen], label=label, linewidths=1.1, **look)
 
 
 def _correlation_title(points: Sequence[Point], name: str) -> str:

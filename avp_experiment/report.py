@@ -142,11 +142,10 @@ def _machine(machine: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Report:
-    """Make every table and figure of an experiment from its results.json, and the page that holds them.
+    """Make every table and figure of an experiment from its results.json, and the page that holds them, results.md.
 
-    Written into the same folder: results.md, claims.md, table2 and table3 (.md and .csv), and the figures (.png). A
-    file reading.md beside them, written by hand, becomes a part of the page. What cannot be made is left out; the page
-    says why.
+    A file reading.md beside them, written by hand, becomes a part of the page. What cannot be made is left out; the
+    page says why.
     """
 
     folder: Positional[Path]

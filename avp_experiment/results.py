@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +24,8 @@ from avp_habitat.provenance import PACKAGES, installed_versions
 
 FORMAT = 1
 FILE, PICTURES = "results.json", "pictures"
-PARTS = {"training": TRAINING, "rollouts": COLLECT, "reconstructions": RECONSTRUCT}
+CELLS = {"training": TRAINING, "rollouts": COLLECT, "reconstructions": RECONSTRUCT}
 """Kinds of cells by their keys in the file."""
-Made = TypeVar("Made")
 Key = tuple[str, int, int]
 """Scene, seed and start: what two methods have in common."""
 
@@ -92,7 +91,7 @@ class Results:
     """In the order of the tables."""
     origin: Mapping[str, Any]
     """Command, commits, machine, versions."""
-    trainings: tuple[Training, ...]
+    training: tuple[Training, ...]
     rollouts: tuple[Episode, ...]
     reconstructions: tuple[Reconstruction, ...]
     failed: tuple[Mapping[str, str], ...]
@@ -109,13 +108,7 @@ class Results:
         return f"{count} seed" if count == 1 else f"{count} seeds"
 
     def values(self, method: str, role: str, name: str) -> dict[Key, float]:
-        """A figure of a method by episode, as far as it is known; a score of its whole reconstruction.
-
-        Args:
-            method: its name.
-            role: of the scenes: train or unseen.
-            name: of the figure.
-        """
+        """A figure of a method by episode in scenes of a role, as far as it is known; a score of all its frames."""
         of = (method, role)
         scores = {one.key: one.scores for one in self.reconstructions if one.whole and (one.method, one.role) == of}
         metrics = {one.key: one.metrics for one in self.rollouts if (one.method, one.role) == of}
@@ -149,10 +142,7 @@ def floor_of(entry: Mapping[str, Any]) -> NDArray[np.uint16]:
 
 
 def read_results(folder: Path) -> Results:
-    """Read the results of an experiment.
-
-    Args:
-        folder: of the experiment.
+    """Read the results in an experiment's folder.
 
     Raises:
         UsageError: there is no such folder, or no `results.json` in it.
@@ -168,28 +158,15 @@ def read_results(folder: Path) -> Results:
     if not isinstance(value, dict) or value.get("format") != FORMAT:
         found = value.get("format") if isinstance(value, dict) else type(value).__name__
         raise AVPError(f"{path}: expected results of format {FORMAT}, found {found!r}")
-    return Results(
-        folder=folder,
-        configuration=_part(path, value, "configuration", _configuration),
-        methods=_part(path, value, "methods", lambda names: tuple(str(name) for name in names)),
-        origin=_part(path, value, "origin", dict),
-        trainings=_each(path, value, "training", _training),
-        rollouts=_each(path, value, "rollouts", _episode),
-        reconstructions=_each(path, value, "reconstructions", _reconstruction),
-        failed=_each(path, value, "failed", lambda one: {name: one[name] for name in ("cell", "reason", "log")}),
-    )
+    found = {name: _part(path, value, name, made_of) for name, made_of in _PARTS.items()}
+    return Results(folder, **found)
 
 
-def _part(path: Path, value: Mapping[str, Any], name: str, made_of: Callable[[Any], Made]) -> Made:
+def _part(path: Path, value: Mapping[str, Any], name: str, made_of: Callable[[Any], Any]) -> Any:
     try:
         return made_of(value[name])
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise AVPError(f"{path}: {name}: missing or damaged: {error!r}") from None
-
-
-def _each(path: Path, value: Mapping[str, Any], name: str, made_of: Callable[[Any], Made]) -> tuple[Made, ...]:
-    entries = {f"{name}[{index}]": entry for index, entry in enumerate(_part(path, value, name, list))}
-    return tuple(_part(path, entries, place, made_of) for place in entries)
 
 
 def _configuration(entry: Any) -> dict[str, Any]:
@@ -232,14 +209,29 @@ def _reconstruction(entry: Any) -> Reconstruction:
     )
 
 
+_PARTS: dict[str, Callable[[Any], Any]] = {
+    "configuration": _configuration,
+    "methods": tuple,
+    "origin": dict,
+    "training": lambda entries: tuple(map(_training, entries)),
+    "rollouts": lambda entries: tuple(map(_episode, entries)),
+    "reconstructions": lambda entries: tuple(map(_reconstruction, entries)),
+    "failed": lambda entries: tuple({name: one[name] for name in ("cell", "reason", "log")} for one in entries),
+}
+"""What each part of the file becomes."""
+
+
 def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], *, command: str) -> dict[str, Any]:
-    """The content of `results.json` (docs/experiment.md describes it) of what is done by now, also written.
+    """Write `results.json` (docs/experiment.md describes it) of what is done by now, with pictures beside it.
 
     Args:
         configuration: of the experiment.
-        folder: of the experiment; pictures of held-out views are copied to where the results are.
+        folder: of the experiment.
         cells: all of them.
         command: that was typed.
+
+    Returns:
+        The content.
     """
     done = [(cell, record) for cell in cells if (record := folder.record(cell)) is not None]
     results = {
@@ -254,7 +246,7 @@ def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], 
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
             "hours": round(sum(record["seconds"] for _, record in done) / 3600, 2),
         },
-        **{part: [_entry(cell, folder) for cell, _ in done if cell.kind == kind] for part, kind in PARTS.items()},
+        **{part: [_entry(cell, folder) for cell, _ in done if cell.kind == kind] for part, kind in CELLS.items()},
         "failed": [
             {"cell": cell.key, "reason": reason, "log": str(folder.log(cell).relative_to(folder.root))}
             for cell in cells

@@ -23,17 +23,11 @@ class Summary:
     half_width: float
     """Of the interval (Student's t over seeds); nan for one seed."""
     seeds: int
-    """How many."""
 
     @property
-    def low(self) -> float:
-        """Lower end of the interval; nan for one seed."""
-        return self.mean - self.half_width
-
-    @property
-    def high(self) -> float:
-        """Upper end of the interval; nan for one seed."""
-        return self.mean + self.half_width
+    def interval(self) -> tuple[float, float]:
+        """Its ends; nan for one seed."""
+        return self.mean - self.half_width, self.mean + self.half_width
 
     def text(self, name: str, *, sign: bool = False) -> str:
         """Mean ± half the interval, without ± for one seed, as the figure of this name is shown; no unit."""
@@ -47,11 +41,9 @@ class Correlation:
     """Spearman's rank correlation ρ with a bootstrap interval."""
 
     rho: float
-    """Within [-1, 1]."""
     low: float
     """Lower end of the 95 % interval; nan where there is one rollout only."""
     high: float
-    """Upper end."""
     points: int
     """Reconstructions."""
     rollouts: int
@@ -102,16 +94,11 @@ def saved_share(less: Mapping[Key, float], more: Mapping[Key, float]) -> Summary
 
 
 def at_views(curve: Mapping[int, float], views: float) -> float | None:
-    """A figure at a number of views, linear between the measured ones; None outside of them.
-
-    Args:
-        curve: by number of views, ascending.
-        views: asked for.
-    """
-    measured = list(curve)
+    """A figure at a number of views, by number of views, linear between measured ones; None outside of them."""
+    measured = sorted(curve)
     if not measured or not measured[0] <= views <= measured[-1]:
         return None
-    return float(np.interp(views, measured, list(curve.values())))
+    return float(np.interp(views, measured, [curve[k] for k in measured]))
 
 
 def views_to_reach(curve: Mapping[int, float], target: float) -> float | None:
@@ -121,24 +108,16 @@ def views_to_reach(curve: Mapping[int, float], target: float) -> float | None:
         curve: by number of views, ascending. A target that the first one has reached is answered with that one.
         target: of the figure.
     """
-    before: tuple[int, float] | None = None
-    for views, value in curve.items():
-        if value >= target:
-            if before is None:
-                return float(views)
-            share = (target - before[1]) / (value - before[1])
-            return before[0] + share * (views - before[0])
-        before = (views, value)
-    return None
+    measured, values = list(curve), list(curve.values())
+    reached = next((place for place, value in enumerate(values) if value >= target), None)
+    if not reached:
+        return None if reached is None else float(measured[0])
+    both = slice(reached - 1, reached + 1)
+    return float(np.interp(target, values[both], measured[both]))
 
 
 def spearman(x: ArrayLike, y: ArrayLike, rollout: Sequence[object]) -> Correlation | None:
-    """Spearman's ρ over reconstructions; its interval draws rollouts, as those of one rollout are not independent.
-
-    Args:
-        x: `(n,)`.
-        y: `(n,)`.
-        rollout: `(n,)` which one each point belongs to.
+    """Spearman's ρ of `(n,)` and `(n,)`; its interval draws whole rollouts, `(n,)`, whose points are not independent.
 
     Returns:
         None for fewer than three points, or where one of the two does not vary.
@@ -194,7 +173,6 @@ class Point:
     """One reconstruction."""
 
     method: str
-    """That took its views."""
     rollout: tuple[str, str, int, int]
     """Method, scene, seed and start."""
     whole: bool
@@ -219,15 +197,7 @@ def points_of(results: Results) -> list[Point]:
 
 
 def correlations(points: Sequence[Point], name: str) -> dict[str, Correlation | None]:
-    """Spearman's ρ of a predictor with PSNR: over all, of whole episodes, of first frames, in each scene.
-
-    Args:
-        points: of all reconstructions.
-        name: of `PREDICTORS`.
-
-    Returns:
-        By what was correlated; None where there are too few points.
-    """
+    """Spearman's ρ of a predictor with PSNR: over all, of whole episodes, of first frames, in each scene."""
     groups = {
         "all": list(points),
         "whole episodes": [point for point in points if point.whole],

@@ -55,12 +55,7 @@ class Table:
 
 
 def make_table(results: Results, role: str) -> Table | None:
-    """The table of one kind of scenes; None where no method has an episode there.
-
-    Args:
-        results: of the experiment.
-        role: of the scenes: train or unseen.
-    """
+    """The table of the scenes of a role; None where no method has an episode there."""
     known = dict.fromkeys(name for one in results.rollouts for name in one.metrics)
     # `return_NAME` is a part of the reward, not a figure.
     names = (*COLUMNS, *(name for name in known if name not in FIGURES and not name.startswith("return_")))

@@ -55,16 +55,7 @@ def open_parent(name: str) -> Parent:
 
 
 def log_results(parent: Parent, results: Mapping[str, Any], folder: Path) -> None:
-    """Tables, figures and means into the parent, its trainings below it, and a run for each method, scene and seed.
-
-    Args:
-        parent: the run.
-        results: the content of `results.json`.
-        folder: of the experiment.
-
-    Raises:
-        TrackingError: the store cannot be used.
-    """
+    """Tables, figures and means into the parent, its trainings below it, and a run for each method, scene and seed."""
     run = parent.run
     settings = {name: value for name, value in results["configuration"].items() if name != "scenes"}
     scenes = {f"scene.{scene['role']}.{i}": scene["name"] for i, scene in enumerate(results["configuration"]["scenes"])}

@@ -301,12 +301,12 @@ BAD = {
     "half a rollout": (
         lambda folder: spoiled(folder, lambda v: v["rollouts"][2].pop("metrics")),
         1,
-        r"rollouts[2]: missing or damaged: KeyError('metrics')",
+        r"rollouts: missing or damaged: KeyError('metrics')",
     ),
     "a text for a number": (
         lambda folder: spoiled(folder, lambda v: v["reconstructions"][0].update(frames="many")),
         1,
-        "reconstructions[0]: missing or damaged",
+        "reconstructions: missing or damaged",
     ),
     "a damaged map": (
         lambda folder: spoiled(folder, lambda v: v["rollouts"][0]["map"].update(floor="####")),
