@@ -1,7 +1,6 @@
 """How well agents have seen the surface of their scenes so far in their episodes."""
 
 import hashlib
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,21 +128,3 @@ def raise_quality(
     growth = (value - quality[at]).astype(np.float64)
     quality[at] = value
     return np.bincount(agent, weights=growth, minlength=len(rows)).astype(np.float64)
-
-
-def room_surfaces(
-    simulators: Sequence[Simulator], settings: TaskSettings, room_of: NDArray[np.integer]
-) -> list[RoomSurface | None]:
-    """A memory for each scene; None where the settings need none.
-
-    Args:
-        simulators: one for each scene.
-        settings: of the task.
-        room_of: `(n,)` the scene of each agent.
-    """
-    if not settings.with_surface:
-        return [None] * len(simulators)
-    return [
-        RoomSurface(scene, settings, len(room_of), np.flatnonzero(room_of == index))
-        for index, scene in enumerate(simulators)
-    ]
