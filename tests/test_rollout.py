@@ -330,7 +330,6 @@ DAMAGES = {
 
 
 def test_a_pose_written_with_few_digits_is_still_rigid(rollout):
-    """Between the quick test for thousands of poses and the tolerance, the exact test decides."""
     path = rollout / "poses/frame_00001.txt"
     np.savetxt(path, np.loadtxt(path).round(4), fmt="%.4f")
     written = np.loadtxt(path)

@@ -7,7 +7,6 @@ import json
 import os
 import reprlib
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -27,8 +26,6 @@ POSE_CONVENTION = (
 )
 HELDOUT = "heldout"
 
-# A pose that is rigid within this is so within the tolerance of `rigidity_fault`, which decides on all others.
-_CLEARLY_RIGID = 5e-5
 # Of 16 numbers, written with all their digits; a pose file longer than this is none.
 _LONGEST_POSE_BYTES = 4096
 # Beyond any size in pixels or metres.
@@ -196,20 +193,8 @@ def _check_text(path: Path, text: str, name: str) -> None:
         raise RolloutError(f"{path}: expected {name} to be Unicode text, found {text[:20]!a}") from None
 
 
-def read_poses(paths: Sequence[str]) -> NDArray[np.float64]:
-    """`(n, 4, 4)` camera_to_world of text files, checked to be rigid.
-
-    Raises:
-        RolloutError: one is missing, not 16 numbers, or not a rigid transform; the first such file is named.
-    """
-    poses = np.array([_pose_numbers(path) for path in paths]).reshape(-1, 4, 4)
-    for index in np.flatnonzero(~_clearly_rigid(poses)):
-        if fault := rigidity_fault(poses[index]):
-            raise RolloutError(f"{paths[index]}: not a rigid camera_to_world: {fault}")
-    return poses
-
-
-def _pose_numbers(path: str) -> list[float]:
+def _read_pose(path: str) -> NDArray[np.float64]:
+    """A `(4, 4)` camera_to_world text file, checked to be rigid."""
     try:
         with open(path, "rb", buffering=0) as file:
             numbers = [float(word) for word in file.read(_LONGEST_POSE_BYTES).split()]
@@ -221,18 +206,10 @@ def _pose_numbers(path: str) -> list[float]:
         raise RolloutError(f"{path}: expected 4 rows of 4 numbers, found {len(numbers)} numbers")
     if beyond := [number for number in numbers if abs(number) >= _BEYOND_ANY_SIZE]:
         raise RolloutError(f"{path}: expected metres, found {beyond[0]:g}")
-    return numbers
-
-
-def _clearly_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """`(n,)` whether each of `(n, 4, 4)` is beyond doubt; one call for thousands."""
-    rotations = poses[:, :3, :3]
-    with np.errstate(all="ignore"):
-        skew = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0)
-        last_row = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1, initial=0)
-        turned = np.linalg.det(rotations) > 0
-        finite = np.isfinite(poses).all(axis=(1, 2))
-    return finite & turned & (np.maximum(skew, last_row) < _CLEARLY_RIGID)
+    pose = np.array(numbers).reshape(4, 4)
+    if fault := rigidity_fault(pose):
+        raise RolloutError(f"{path}: not a rigid camera_to_world: {fault}")
+    return pose
 
 
 def _check_facts(path: Path, meta: dict[str, Any]) -> None:
@@ -294,7 +271,7 @@ def _read_views(root: Path, base: Path, count: int, intrinsics: Intrinsics) -> l
     for kind, suffix in (("images", ".png"), ("depth", ".png"), ("poses", ".txt")):
         _check_listing(root, base / kind, suffix, count)
     stems = [frame_name(index) for index in range(count)]
-    poses = read_poses([f"{base}/poses/{stem}.txt" for stem in stems])
+    poses = [_read_pose(f"{base}/poses/{stem}.txt") for stem in stems]
     size = {"width": intrinsics.width, "height": intrinsics.height}
     for stem in stems:
         check_png_structure(f"{base}/images/{stem}.png", **size, kind=RGB_8)
