@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping
 from importlib import metadata
 from typing import Any
 
-
 PACKAGES = (
     "avp-suite",
     "stable-baselines3",
