@@ -244,7 +244,7 @@ def _over_scenes(values: Mapping[Key, float]) -> dict[Key, float]:
 
 def _heading(name: str) -> str:
     """Of a column of differences: those of percentages are in points."""
-    figure = statistics.figure_named(name)
+    figure = statistics.figure_of(name)
     return f"{figure.title} [points]" if figure.unit == "%" else figure.heading
 
 

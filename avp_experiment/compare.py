@@ -16,13 +16,13 @@ from avp_experiment.folder import open_folder
 from avp_experiment.runner import PRELOAD, Runner, environment
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
+from avp_habitat.metrics import METRICS_HELP, find_metrics
 from avp_habitat.scenes.location import UP_HELP
 from avp_habitat.simulators.registry import SIMULATORS, SimulatorChoice
 
 AUTO = "auto"
 NONE = "none"
 _METHODS = f"with commas between: policies, rewards, rewards with {ROOMS}, module:object; auto: {', '.join(DEFAULT)}"
-_METHODS = f"with commas between: policies, rewards, and rewards with {ROOMS}; auto: {', '.join(DEFAULT)}"
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class Compare:
     """Episodes of each method, scene and seed; auto: the preset's number."""
     methods: Annotated[str, arg(help=_METHODS)] = AUTO
     simulator: Annotated[str, arg(help=f"{', '.join(SIMULATORS)} or MODULE:FACTORY")] = "raycast"
+    metrics: Annotated[str, arg(help=f"with commas between: {METRICS_HELP}")] = ""
     up: Annotated[str | None, arg(help=UP_HELP)] = None
     out: str = AUTO
     """The experiment's folder, also of one to go on with; auto: runs/experiment-PRESET."""
@@ -64,7 +65,9 @@ class Compare:
         preset = replace(preset, starts=_number("starts", self.starts, preset.starts))
         choice = SimulatorChoice(self.simulator, up=self.up)
         scenes = read_scenes(_split(self.scene), [] if self.unseen == NONE else _split(self.unseen), choice)
-        return Configuration(self.preset, preset, scenes, methods, self.simulator, self.up)
+        metrics = tuple(_split(self.metrics))
+        find_metrics(metrics)
+        return Configuration(self.preset, preset, scenes, methods, self.simulator, metrics, self.up)
 
     @property
     def line(self) -> str:

@@ -151,6 +151,8 @@ class Configuration:
     """Of training first, then unseen ones."""
     methods: tuple[Method, ...]
     simulator: str = "raycast"
+    metrics: tuple[str, ...] = ()
+    """Further ones, of episodes and rollouts."""
     up: str | None = None
     """Axis of mesh files that points up; the scenes' digests cover it."""
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from avp_experiment.configuration import ROOMS, TRAIN
 from avp_experiment.results import Key, Results
-from avp_experiment.statistics import Summary, figure_named, summary
-from avp_habitat.metrics import FIGURES, Figure
+from avp_experiment.statistics import Summary, summary
+from avp_habitat.metrics import FIGURES, Figure, figure_of
 from avp_habitat.tables import table
 
 SCORES = ("psnr", "ssim", "lpips")
@@ -65,15 +65,13 @@ def make_table(results: Results, role: str) -> Table | None:
         return None
     shown = [name for name in names if any(values[name] for values in found.values())]
     rows = {method: {name: summary(values[name]) for name in shown} for method, values in found.items()}
-    missing = [
-        f"No {figure_named(name).heading}: {_why_missing(results, name)}." for name in names if name not in shown
-    ]
+    missing = [f"No {figure_of(name).heading}: {_why_missing(results, name)}." for name in names if name not in shown]
     return Table(
-        columns=tuple(figure_named(name) for name in shown),
+        columns=tuple(figure_of(name) for name in shown),
         rows=rows,
         episodes={method: len(values["coverage"]) for method, values in found.items()},
         notes=(
-            *(f"No {figure_named(name).heading}: {_why_missing(results, name)}." for name in missing),
+            *(f"No {figure_of(name).heading}: {_why_missing(results, name)}." for name in missing),
             *_notes(results, role, found),
         ),
     )

@@ -14,6 +14,7 @@ from avp_habitat import command
 from avp_habitat.command import progress
 from avp_habitat.errors import UsageError
 from avp_habitat.files import check_new, check_writable
+from avp_habitat.metrics import METRICS_HELP
 from avp_habitat.policies.registry import POLICY_NAMES, TRUSTED, check_policy, described
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.drawing import draw_trajectory
@@ -46,6 +47,7 @@ class Evaluate:
     observation: Annotated[str | None, arg(help=f"{', '.join(OBSERVATION_NAMES)} (omitted: the model's own)")] = None
     simulator: SimulatorChoice = field(default_factory=SimulatorChoice)
     """Which simulator opens the scene."""
+    metrics: Annotated[tuple[str, ...], arg(help=METRICS_HELP)] = ()
     budget: int = 80
     """Steps, which are views."""
     width: int = 160
@@ -72,7 +74,9 @@ class Evaluate:
     @property
     def settings(self) -> TaskSettings:
         """Of the task."""
-        return TaskSettings(reward=self.reward, budget=self.budget, width=self.width, height=self.height)
+        return TaskSettings(
+            reward=self.reward, metrics=self.metrics, budget=self.budget, width=self.width, height=self.height
+        )
 
 
 def main(options: Evaluate) -> None:

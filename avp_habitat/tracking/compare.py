@@ -17,7 +17,16 @@ from tyro.conf import UseAppendAction, arg
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
 from avp_habitat.files import NewFolder
-from avp_habitat.metrics import FIGURES, coverage_per_view, explained, mean_and_half_width
+from avp_habitat.metrics import (
+    FIGURES,
+    METRICS_HELP,
+    Figure,
+    coverage_per_view,
+    explained,
+    figures,
+    find_metrics,
+    mean_and_half_width,
+)
 from avp_habitat.tables import table
 from avp_habitat.tracking.experiments import DEFAULT_HELP, chosen_experiment, find_experiment
 from avp_habitat.tracking.names import (
@@ -48,9 +57,7 @@ if TYPE_CHECKING:
     from mlflow.entities import Experiment
 
 TABLE, MARKDOWN, PICTURE = "comparison.json", "comparison.md", "comparison.png"
-_SHOWN = [FIGURES[name] for name in ("views", "coverage", "cpv", "visibility", "psnr", "ssim", "lpips")]
-COLUMNS = ("policy", "scene", "method", "runs", *(figure.heading for figure in _SHOWN))
-"""Of the table."""
+_ALWAYS = [FIGURES[name] for name in ("views", "coverage", "cpv", "visibility", "psnr", "ssim", "lpips")]
 _MOST_RUNS = 50_000  # that MLflow gives in one answer
 _HOW_TO_READ = f"""
 More PSNR and SSIM are better, less LPIPS; fewer views are better. Means over the runs; ± is half of the 95 % interval.
@@ -76,12 +83,13 @@ class Method:
     halves: Mapping[str, float]
     """Half of the 95 % interval, where more than one run or episode tells of the spread."""
 
-    def cells(self) -> list[str]:
-        """As `COLUMNS` says."""
-        halves = {figure.name: self.halves.get(figure.name, math.nan) for figure in _SHOWN}
-        known = self.means
-        figures = [one.text(known[one.name], halves[one.name]) if one.name in known else "–" for one in _SHOWN]
-        return [self.policy, self.scene, self.method, str(self.runs), *figures]
+    def cells(self, shown: Sequence[Figure]) -> list[str]:
+        """The row, with these figures."""
+        known, halves = self.means, self.halves
+        texts = [
+            one.text(known[one.name], halves.get(one.name, math.nan)) if one.name in known else "–" for one in shown
+        ]
+        return [self.policy, self.scene, self.method, str(self.runs), *texts]
 
 
 def compare(client: "MlflowClient", experiment_id: str) -> list[Method]:
@@ -111,7 +119,7 @@ def compare(client: "MlflowClient", experiment_id: str) -> list[Method]:
 
 def _method(policy: str, scene: str, method: str, runs: Sequence[Mapping[str, float]]) -> Method:
     means, halves = {}, {}
-    for name in (figure.name for figure in _SHOWN):
+    for name in [figure.name for figure in _ALWAYS] + [name for name in figures() if name not in FIGURES]:
         values = [run[f"eval/{name}"] for run in runs if f"eval/{name}" in run]
         if values:
             mean, half = mean_and_half_width(values)
@@ -128,19 +136,27 @@ def _rank(method: Method) -> tuple[Any, ...]:
     return method.scene, -psnr, -method.means["coverage"], method.policy, method.method
 
 
+def rows(methods: Sequence[Method]) -> tuple[list[str], list[list[str]]]:
+    """Head and rows of the table; a user's metric has a column where a run has it."""
+    further = [figure for name, figure in figures().items() if name not in FIGURES]
+    shown = [*_ALWAYS, *(one for one in further if any(one.name in method.means for method in methods))]
+    head = ["policy", "scene", "method", "runs", *(figure.heading for figure in shown)]
+    return head, [method.cells(shown) for method in methods]
+
+
 def markdown(methods: Sequence[Method]) -> str:
     """The table."""
-    return table(COLUMNS, [method.cells() for method in methods]) + "\n"
+    return table(*rows(methods)) + "\n"
 
 
 def picture(methods: Sequence[Method], path: Path) -> bool:
     """Draw PSNR against views, one point per method; False where none has a reconstruction."""
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Drawing
 
     drawn = [method for method in methods if "psnr" in method.means]
     if not drawn:
         return False
-    drawing = Figure(figsize=(6.4, 4), layout="constrained")
+    drawing = Drawing(figsize=(6.4, 4), layout="constrained")
     axes = drawing.subplots()
     for method in drawn:
         # What tells a row from the others.
@@ -180,7 +196,7 @@ def keep(client: "MlflowClient", experiment_id: str, methods: Sequence[Method]) 
     run = kept[0] if kept else client.create_run(experiment_id, run_name=COMPARISON, tags=tags)
     run_id = run.info.run_id
     try:
-        client.log_dict(run_id, {"columns": COLUMNS, "data": [method.cells() for method in methods]}, TABLE)
+        client.log_dict(run_id, dict(zip(("columns", "data"), rows(methods), strict=True)), TABLE)
         # As `log_table` does, which would append to a table that is there.
         client.set_tag(run_id, "mlflow.loggedArtifacts", json.dumps([{"path": TABLE, "type": "table"}]))
         with tempfile.TemporaryDirectory() as folder:
@@ -210,11 +226,13 @@ class Compare:
     mlflow: Annotated[str, arg(help=ADDRESS_HELP)] = "auto"
     scene: UseAppendAction[tuple[str, ...]] = ()
     """Only this scene; give it again for more."""
+    metrics: Annotated[tuple[str, ...], arg(help=f"{METRICS_HELP}; registered ones are shown without")] = ()
     out: Path | None = None
     """Write table and picture to this folder, too; must not exist."""
 
     def __post_init__(self) -> None:
-        """Refuse no place."""
+        """Refuse no place, and metrics that there are not."""
+        find_metrics(self.metrics)
         if self.mlflow == "off":
             raise UsageError("mlflow: expected an address or auto, got off: it is MLflow's runs that are compared")
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avp_habitat import metrics
 from avp_habitat.metrics import FIGURES, Figure
 from avp_habitat.policies.registry import check_policy, make_policy, make_policy_env, steps_of
 from avp_habitat.simulators.base import Simulator
@@ -32,8 +33,7 @@ def figure_of(name: str) -> Figure:
     Args:
         name: as in `Episode.figures`.
     """
-    known = FIGURES | {figure.name: figure for figure in OF_CURVE}
-    return known.get(name) or Figure(name, name, digits=3)
+    return {figure.name: figure for figure in OF_CURVE}.get(name) or metrics.figure_of(name)
 
 
 @dataclass(frozen=True)
