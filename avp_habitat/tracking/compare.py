@@ -16,7 +16,7 @@ from tyro.conf import UseAppendAction, arg
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
-from avp_habitat.files import NewFolder
+from avp_habitat.files import atomic_folder, check_new
 from avp_habitat.metrics import (
     FIGURES,
     METRICS_HELP,
@@ -242,7 +242,8 @@ def main(options: Compare) -> None:
     from mlflow.exceptions import MlflowException
 
     address = str(address_of(options.mlflow, default=DEFAULT_ADDRESS))
-    folder = None if options.out is None else NewFolder(options.out, failure=UsageError)
+    if options.out is not None:
+        check_new(options.out, option="--out")
     client = connect(address)
     try:
         experiment = _experiment(client, options.experiment)
@@ -252,10 +253,10 @@ def main(options: Compare) -> None:
         prepare_experiment(client, experiment.experiment_id)
     except MlflowException as error:
         raise TrackingError(f"MLflow at {shown(address)} does not answer: {first_line(error)}") from None
-    if folder is not None:
-        with folder:
-            _write(folder.path("."), methods)
-            print(f"files:   {folder.publish()}")
+    if options.out is not None:
+        with atomic_folder(options.out, failure=UsageError, option="--out") as folder:
+            _write(folder, methods)
+        print(f"files:   {options.out}")
     page = f"#/experiments/{experiment.experiment_id}/runs/{run}?{MODEL_TRAINING}"
     served = urlsplit(address).scheme in ("http", "https")
     there = f"{how_to_look(address).rstrip('/')}/" if served else f"{how_to_look(address)}, then http://127.0.0.1:5000/"
