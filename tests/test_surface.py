@@ -169,8 +169,8 @@ def test_more_doubts_than_there_is_room_for_are_all_decided(room):
     found = []
     for space in (1, 100_000):
         task = ViewpointTask(room, settings, agents=3)
-        senses = task._rooms[0].surface._senses
-        senses._doubtful, senses._doubtful_q = np.empty((space, 2), np.int64), np.empty(space, np.float32)
+        sensor = task._rooms[0].surface._sensor
+        sensor._doubtful, sensor._doubtful_q = np.empty((space, 2), np.int64), np.empty(space, np.float32)
         task.reset(range(3), room.area.centres[[10, 200, 500]], np.zeros(3))
         found.append([task.step(np.full(3, action)).facts.new_surface for action in (1, 0, 2, 4)])
     np.testing.assert_allclose(found[0], found[1], rtol=1e-5)
