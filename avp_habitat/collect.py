@@ -33,9 +33,8 @@ from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.task.rewards import REWARD_NAMES
 from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
-from avp_habitat.tracking.names import open_store
 from avp_habitat.tracking.rollout_run import command_for, rollout_run
-from avp_habitat.tracking.stores import TrackingError, about_run, address_of, shown
+from avp_habitat.tracking.stores import TrackingError, about_run, address_of, open_store, shown
 
 
 @dataclass(frozen=True)

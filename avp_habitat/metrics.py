@@ -12,9 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from avp_habitat import plugins
 from avp_habitat.errors import UsageError
-from avp_habitat.sight.visibility import ALIKE_DEG, ALIKE_DISTANCE, PARALLAX_DEG
 
 Float = NDArray[np.floating]
+
+
+ALIKE_DEG = 60.0
+"""A frame sees a surface as the held-out view does when its ray is turned by no more than this, degrees."""
+ALIKE_DISTANCE = 2.0
+"""And when it stands no more than this many times as far away."""
+PARALLAX_DEG = 10.0
+"""Rays this far apart show how far away a surface is, degrees."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +133,10 @@ def metric(figure: Figure, *, of: Of = "episode") -> Callable[[MetricFunction], 
     return plugins.declares(figure=figure, of=of)
 
 
+_found: dict[str, Figure] = {}
+"""Of the metrics that this process has found, for the tables that show them."""
+
+
 def find_metrics(chosen: Sequence[str | MetricFunction]) -> list[Any]:
     """The functions behind the names of metrics: `module:function`, or what another distribution registers.
 
@@ -144,6 +155,7 @@ def find_metrics(chosen: Sequence[str | MetricFunction]) -> list[Any]:
         if figure.name in taken:
             raise UsageError(f"metric {said!r}: there is a figure named {figure.name!r} already; choose another name")
         taken.add(figure.name)
+        _found[figure.name] = figure
     return found
 
 
@@ -163,19 +175,20 @@ def measured(chosen: Iterable[str | MetricFunction], of: Of, thing: Any) -> dict
     return values
 
 
-def figures(chosen: Iterable[str | MetricFunction] = ()) -> dict[str, Figure]:
-    """All figures by name: the suite's, those of the chosen metrics, and those that other distributions register.
+def figures() -> dict[str, Figure]:
+    """All figures by name: the suite's, those of metrics found in this process, and those that distributions register.
 
-    A registered metric that cannot be imported is left out: what it measured is then shown by nobody.
-
-    Args:
-        chosen: metrics that are named by `module:function`, or given as they are.
+    A registered metric that cannot be imported is left out: what it measured is then shown by its key.
     """
-    own = {function.figure.name: function.figure for function in find_metrics(tuple(chosen))}
     for name in plugins.names("avp.metrics", ()):
         with suppress(UsageError):
-            own |= {function.figure.name: function.figure for function in find_metrics((name,))}
-    return FIGURES | own
+            find_metrics((name,))
+    return FIGURES | _found
+
+
+def figure_of(name: str) -> Figure:
+    """How a figure is called and shown; one that nobody here knows, by its key."""
+    return figures().get(name) or Figure(name, name.replace("_", " "), digits=3)
 
 
 def coverage(observed: NDArray[np.bool_], navigable: NDArray[np.bool_]) -> float:

@@ -16,8 +16,7 @@ from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.metrics import TERMS, explained
 from avp_habitat.ranges import Range, number
 from avp_habitat.tracking.experiments import DEFAULT_HELP
-from avp_habitat.tracking.names import open_store
-from avp_habitat.tracking.stores import DEFAULT_ADDRESS, about_run, address_of
+from avp_habitat.tracking.stores import DEFAULT_ADDRESS, about_run, address_of, open_store
 
 if TYPE_CHECKING:
     from avp_habitat.tracking.run import TrackedRun

@@ -18,8 +18,7 @@ from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.files import NewFolder
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.format import Rollout, read_rollout
-from avp_habitat.tracking.names import open_store
-from avp_habitat.tracking.stores import address_of
+from avp_habitat.tracking.stores import address_of, open_store
 
 
 @dataclass(frozen=True)

@@ -143,16 +143,17 @@ class _Bench:
 
     def first_evaluation(self) -> dict[str, Any]:
         """CPU seconds of the default evaluation: opening its scene, the first time in it, and later ones."""
+        from avp_sb3 import AVPVecEnv
         from avp_sb3.callbacks.evaluation import DEFAULT_EPISODES, DEFAULT_EVERY, DEFAULT_SCENES
-        from avp_sb3.evaluation.batch import FixedStarts, run_batch
+        from avp_sb3.evaluation.batch import run_batch
 
         model, seconds = self.model(self.options.seed), []
         start = time.process_time()
-        env = FixedStarts(DEFAULT_SCENES, episodes=DEFAULT_EPISODES, simulator="raycast", settings=self.settings)
+        env = AVPVecEnv(DEFAULT_SCENES, agents=DEFAULT_EPISODES * len(DEFAULT_SCENES), settings=self.settings)
         open_s = time.process_time() - start
         for _ in range(6):
             start = time.process_time()
-            run_batch(model, env, dict.fromkeys(range(env.num_envs), 1), seed=1000, deterministic=False)
+            run_batch(model, env, DEFAULT_EPISODES, seed=1000, deterministic=False)
             seconds.append(time.process_time() - start)
         return {
             "scenes": ", ".join(DEFAULT_SCENES),

@@ -11,13 +11,12 @@ from scipy.ndimage import gaussian_filter, maximum_filter, uniform_filter, zoom
 
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics, camera_to_world
-from avp_habitat.scenes.builtin.floorplan import largest_part
+from avp_habitat.scenes.builtin.furnish import largest_part
 from avp_habitat.scenes.builtin.kit import FLAT_M, Kit
-from avp_habitat.scenes.builtin.noise import Random
+from avp_habitat.scenes.builtin.noise import Random, fractal
 from avp_habitat.scenes.builtin.room import generate_room, plan_room
 from avp_habitat.scenes.builtin.shapes import Material, box, cushion, cylinder, lathe
 from avp_habitat.scenes.builtin.shell import Shell
-from avp_habitat.scenes.builtin.noise import fractal
 from avp_habitat.scenes.loader import Scene
 from avp_habitat.simulators.raycast import RaycastSimulator
 

@@ -23,8 +23,6 @@ LIGHT = (
     "ranges",
     "rollout.format",
     "rollout.png",
-    "sight.coverage",
-    "sight.visibility",
     "task.rewards",
     "task.trajectory",
 )

@@ -179,9 +179,7 @@ def test_rollouts_of_one_scene_that_lie_differently_are_not_merged(pair, lies):
 
 def test_rollouts_of_different_cameras_are_not_merged(pair, tmp_path):
     wide = write_known_room(tmp_path / "wide", frames=1, width=40)
-    text = (
-        r"wide/rollout\.json: expected the camera of .*one/rollout\.json, .*width=32.*found .*width=40.*--width 32"
-    )
+    text = r"wide/rollout\.json: expected the camera of .*one/rollout\.json, .*width=32.*found .*width=40.*--width 32"
     with pytest.raises(RolloutError, match=text):
         parse(pair[0], also=(wide,))
     edit(pair[1], lambda meta: meta["camera"].update(fx=meta["camera"]["fx"] * 1.03))

@@ -24,8 +24,7 @@ from avp_habitat.task.rewards import (
 from avp_habitat.task.settings import TaskSettings
 from avp_sb3 import AVPVecEnv
 from avp_sb3.callbacks.metrics import EpisodeWindow
-from avp_sb3.rerun.recording import write_rollout_recording
-from avp_sb3.rerun.rollout import Steps
+from avp_sb3.rerun.rollout import read_steps, write_rollout_recording
 
 # All different and none a special value, so that a swapped or forgotten constant changes a sum.
 CONSTANTS = RewardConstants(
@@ -170,7 +169,7 @@ def test_a_rollout_holds_the_parts_by_their_names_also_those_of_later_steps_only
             _, reward, _, _, info = env.step(action)
             capture_step(env, writer, action, reward, info)
         publish_rollout(env, writer, info, policy={"name": "a list"}, seed=0, heldout=0)
-    plots = Steps(tmp_path / "r" / "steps.csv", frames=12).plots()
+    plots, _ = read_steps(tmp_path / "r" / "steps.csv", frames=12)
     parts = {name.removeprefix("reward/"): values for name, values in plots.items() if name.startswith("reward/")}
     total = parts.pop("sum")
     assert set(parts) == {"look, around", "time", "blocked/twice"}

@@ -12,9 +12,10 @@ from avp_habitat.poses import axes_to_world
 from avp_habitat.scenes.files import SceneFiles
 from avp_habitat.scenes.location import BUILTIN, Frame, SceneLocation, locate
 from avp_habitat.scenes.mesh import TexturedMesh, say_once
+from avp_habitat.scenes.obj import read_obj
+from avp_habitat.scenes.ply import read_ply
 from avp_habitat.scenes.stage_config import Y_UP, Axes
 
-_GLTF = (".glb", ".gltf")
 _MOST_LOST_MM = 100
 _FAR_M = 1000.0
 """From here on, float32 has steps of more than 0.06 mm."""
@@ -59,7 +60,7 @@ def load_located(location: SceneLocation, *, origin: Sequence[float] | None = No
     if location.asset is None:
         from avp_habitat.scenes.builtin.room import generate_room
 
-        return Scene(location.name, identify(location)[0], generate_room(_seed(location)))
+        return Scene(location.name, identify(location)[0], generate_room(int(location.name.removeprefix(BUILTIN))))
     if location.objects:
         raise SceneError(
             f"{location.dataset}:{location.scene_id}: has {location.objects} objects besides its stage, which raycast "
@@ -83,8 +84,7 @@ def identify(location: SceneLocation) -> tuple[str, Frame]:
     if location.asset is None:
         from avp_habitat.scenes.builtin.room import GENERATOR_VERSION
 
-        text = f"{BUILTIN}{_seed(location)}:v{GENERATOR_VERSION}"
-        return hashlib.sha256(text.encode()).hexdigest(), Frame()
+        return hashlib.sha256(f"{location.name}:v{GENERATOR_VERSION}".encode()).hexdigest(), Frame()
     files = SceneFiles(location.asset)
     frame = Frame(up=location.told_up)
     try:
@@ -94,10 +94,6 @@ def identify(location: SceneLocation) -> tuple[str, Frame]:
         if "KHR_texture_basisu" not in str(error):
             raise
     return _digest(location, files), frame
-
-
-def _seed(location: SceneLocation) -> int:
-    return int(location.name.removeprefix(BUILTIN))
 
 
 def _digest(location: SceneLocation, files: SceneFiles) -> str:
@@ -112,13 +108,14 @@ def _digest(location: SceneLocation, files: SceneFiles) -> str:
 
 def _read(files: SceneFiles) -> TexturedMesh:
     suffix = files.path.suffix.lower()
-    if suffix in _GLTF:
-        from avp_habitat.scenes.gltf import read_gltf as read
-    elif suffix == ".ply":
-        from avp_habitat.scenes.ply import read_ply as read
+    if suffix == ".ply":
+        mesh = read_ply(files)
+    elif suffix == ".obj":
+        mesh = read_obj(files)
     else:
-        from avp_habitat.scenes.obj import read_obj as read
-    mesh = read(files)
+        from avp_habitat.scenes.gltf import read_gltf
+
+        mesh = read_gltf(files)
     _check_numbers(mesh, files.path)
     return mesh
 

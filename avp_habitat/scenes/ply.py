@@ -31,13 +31,12 @@ _MALFORMED = (ArithmeticError, LookupError, TypeError, ValueError, struct.error)
 
 @dataclass(frozen=True)
 class _Property:
+    """How values lie in the body, where a text's numbers are float64; a single value has no type of a count."""
+
     name: str
     values: np.dtype
-    """As they lie in the body; every number of a text is a float64 there."""
     count: np.dtype | None
-    """Of a list's number of values; None for a single value."""
     integer: bool
-    """Whether the header says that the values are whole numbers."""
 
 
 @dataclass(frozen=True)
@@ -109,18 +108,15 @@ def _header(lines: list[list[str]]) -> tuple[str, list[_Element]]:
             if elements[-1].rows < 0:
                 raise ValueError(f"element {words[1]} has {words[2]} rows")
         elif words[0] == "property":
-            elements[-1].properties.append(_property(words[1:], order))
+            codes = [_CODES.get(word) for word in (words[2:4] if words[1] == "list" else words[1:2])]
+            if None in codes or not order:
+                raise ValueError(f"expected a property of a known type, got {' '.join(words[1:])}")
+            *count, values = (np.dtype("=f8" if order == "=" else f"{order}{code}") for code in codes)
+            integer = str(codes[-1])[0] in "iu"
+            elements[-1].properties.append(_Property(words[-1], values, count[0] if count else None, integer))
     if not order:
         raise ValueError("the header names no format")
     return order, elements
-
-
-def _property(words: list[str], order: str) -> _Property:
-    codes = [_CODES.get(word) for word in (words[1:3] if words[0] == "list" else words[:1])]
-    if None in codes or not order:
-        raise ValueError(f"expected a property of a known type, got {' '.join(words)}")
-    stored = [np.dtype("=f8" if order == "=" else f"{order}{code}") for code in codes]
-    return _Property(words[-1], stored[-1], stored[0] if len(stored) == 2 else None, str(codes[-1])[0] in "iu")
 
 
 def _numbers(text: bytes) -> bytes:

@@ -34,8 +34,6 @@ class AVPEnv(gymnasium.Env[Observed, np.int64]):
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 4}  # noqa: RUF012 - gymnasium's own declaration
-    failure = None
-    """Why there is no scene; that of a `worker_env.UnopenedEnv` says it."""
 
     def __init__(
         self,

@@ -14,9 +14,8 @@ from nerfstudio.utils import comms
 
 from avp_habitat.command import INTERRUPTED, progress
 from avp_habitat.errors import AVPError
-from avp_habitat.tracking.names import open_store
 from avp_habitat.tracking.run import Status
-from avp_habitat.tracking.stores import address_of
+from avp_habitat.tracking.stores import address_of, open_store
 from avp_nerfstudio.data.refusals import CommandError, discard_outputs
 from avp_nerfstudio.method.checkpoints import loading_fault, newest_checkpoint
 from avp_nerfstudio.tracking.trackers import Trackers

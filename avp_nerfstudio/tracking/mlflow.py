@@ -10,22 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 from avp_habitat.provenance import flat
 from avp_habitat.rollout.format import read_meta
-from avp_habitat.tracking import rollout_facts
-from avp_habitat.tracking.journal import Journal, spool_folder
-from avp_habitat.tracking.names import find_run, open_store, safe_name
-from avp_habitat.tracking.opening import NewRun, continue_run, finish, join_run, journal_of, may_continue, start_run
-from avp_habitat.tracking.rollout_run import rollout_run
-from avp_habitat.tracking.run import TrackedRun
-from avp_habitat.tracking.stores import TrackingError
+from avp_habitat.tracking import names, rollout_run
+from avp_habitat.tracking.deliver import finish
+from avp_habitat.tracking.experiments import find_run
+from avp_habitat.tracking.journal import Journal, journal_of, spool_folder
+from avp_habitat.tracking.names import safe_name
+from avp_habitat.tracking.run import NewRun, TrackedRun, continue_run, join_run, may_continue, start_run
+from avp_habitat.tracking.stores import TrackingError, open_store
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 RUN_FILE = "mlflow_run_id.txt"
 """In a training's folder: the id of its run."""
-METHOD_TAG = "avp.method"
-_CONTINUED_TAG = "avp.continued_from"
-_MAX_TAG = 5000
 # Of no meaning for the result; `mlflow` is an address, which may hold a password.
 _NOT_SETTINGS = ("viewer.", "mlflow", "rerun", "logging.local_writer.", "load_config")
 
@@ -58,21 +55,21 @@ def facts_of(config: Any) -> Facts:
         RolloutError: `rollout.json` or `steps.csv` cannot be read.
     """
     config.set_experiment_name()
-    tags = {METHOD_TAG: str(config.method_name), rollout_facts.KIND_TAG: rollout_facts.RECONSTRUCTION}
+    tags = {names.METHOD_TAG: str(config.method_name), names.KIND_TAG: names.RECONSTRUCTION}
     name = f"{config.method_name} {config.experiment_name}"
     folders = tuple(rollout_folders(config))
     if not folders:
         return Facts(name, _settings(config), tags)
     metas = [read_meta(folder) for folder in folders]
-    ids = [rollout_facts.policy_run_id(folder, meta) for folder, meta in zip(folders, metas, strict=True)]
+    ids = [rollout_run.policy_run_id(folder, meta) for folder, meta in zip(folders, metas, strict=True)]
     policy_runs = tuple(dict.fromkeys(run_id for run_id in ids if run_id is not None))
-    tags |= rollout_facts.origin(metas[0]) | {
-        rollout_facts.ROLLOUT_TAG: _joined(folders),
-        rollout_facts.ROLLOUT_ID_TAG: _joined(map(rollout_facts.rollout_id, folders)),
+    tags |= rollout_run.origin(metas[0]) | {
+        names.ROLLOUT_TAG: _joined(folders),
+        names.ROLLOUT_ID_TAG: _joined(map(rollout_run.rollout_id, folders)),
     }
     if policy_runs:
-        tags[rollout_facts.POLICY_RUN_TAG] = _joined(policy_runs)
-    title = rollout_facts.title(metas[0])
+        tags[names.POLICY_RUN_TAG] = _joined(policy_runs)
+    title = rollout_run.title(metas[0])
     if title is not None and len(folders) == 1 and config.experiment_name in (folders[0].stem, "unnamed"):
         # nerfstudio's own names: that of the folder, or none where the data is given to the dataparser.
         name = f"{config.method_name} {title}"
@@ -80,8 +77,8 @@ def facts_of(config: Any) -> Facts:
     parser = getattr(config.pipeline.datamanager, "dataparser", None)
     usual = (("also", ()), ("every", 1), ("max_views", 0))
     whole = all(getattr(parser, option, value) == value for option, value in usual)
-    params = _settings(config) | rollout_facts.rollout_params(metas[0])
-    figures = rollout_facts.figures(metas[0], "eval" if whole else "rollout")
+    params = _settings(config) | rollout_run.rollout_params(metas[0])
+    figures = rollout_run.figures(metas[0], "eval" if whole else "rollout")
     return Facts(name, params, tags, figures, folders, policy_runs)
 
 
@@ -107,7 +104,7 @@ def _settings(config: Any) -> dict[str, str]:
 
 
 def _joined(values: Iterable[object]) -> str:
-    return ", ".join(map(str, values))[:_MAX_TAG]
+    return ", ".join(map(str, values))[: names.MAX_TAG]
 
 
 def open_run(
@@ -136,7 +133,7 @@ def open_run(
         run.params(facts.params)
         _remember(folder, run)
         return run
-    return _new(address, facts, folder, experiment, {} if earlier is None else {_CONTINUED_TAG: earlier})
+    return _new(address, facts, folder, experiment, {} if earlier is None else {names.CONTINUED_TAG: earlier})
 
 
 def open_again(address: str, facts: Facts, *, folder: Path, experiment: str | None = None) -> tuple[TrackedRun, bool]:
@@ -195,13 +192,13 @@ def _new(address: str, facts: Facts, folder: Path, experiment: str | None, tags:
     policy = facts.policy_runs[0] if len(facts.policy_runs) == 1 else None
     parent, above = policy, {}
     if client is not None:
-        rollouts = [rollout_run(client, rollout, experiment=experiment) for rollout in facts.rollouts]
+        rollouts = [rollout_run.rollout_run(client, rollout, experiment=experiment) for rollout in facts.rollouts]
         found = {run_id: find_run(client, run_id) for run_id in facts.policy_runs}
         if rollouts:
-            above[rollout_facts.ROLLOUT_RUN_TAG] = _joined(rollouts)
+            above[names.ROLLOUT_RUN_TAG] = _joined(rollouts)
         if found:
             ids = (run.info.run_id if run else given for given, run in found.items())
-            above[rollout_facts.POLICY_RUN_TAG] = _joined(ids)
+            above[names.POLICY_RUN_TAG] = _joined(ids)
         run_above = find_run(client, rollouts[0] if len(rollouts) == 1 else policy)
         parent = None if run_above is None else run_above.info.run_id
         if run_above is not None and experiment is None:

@@ -17,9 +17,9 @@ from nerfstudio.utils.writer import EventName, Writer
 from numpy.typing import NDArray
 
 from avp_habitat.errors import UsageError
+from avp_habitat.tracking.deliver import recover_in_background
 from avp_habitat.tracking.journal import spool_folder
 from avp_habitat.tracking.names import OFFLINE
-from avp_habitat.tracking.opening import recover_in_background
 from avp_habitat.tracking.run import Status, TrackedRun
 from avp_habitat.tracking.stores import about_run
 from avp_nerfstudio.method.scores import HeldoutView, error_colours, to_8_bit

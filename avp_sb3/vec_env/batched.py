@@ -45,8 +45,7 @@ class AVPVecEnv(VecEnv):
         """Open the scenes for n agents.
 
         Args:
-            scene: as `avp_habitat.scenes.location.locate` takes it, or several; agent i walks in scene i modulo their
-                number.
+            scene: as `scenes.location.locate` takes it, or several; agent i walks in scene i modulo their number.
             agents: n, at least 1, and at least one for each scene.
             simulator: a simulator's name or factory, or those that are open already, one for each scene (names are then
                 theirs).

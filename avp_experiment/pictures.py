@@ -1,104 +1,47 @@
-"""The figures that are pictures of the scene: top-down maps of episodes, and held-out views with their renders."""
+"""The figures that are pictures of the scene: episodes from above, and held-out views with their renders."""
 
-import base64
-import csv
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from avp_experiment.figures import Made, Missing
-from avp_experiment.look import WIDTH_IN, new_figure
-from avp_experiment.stored import Reconstruction, Results, Rollout
-from avp_habitat.errors import AVPError, RolloutError
+from avp_experiment.configuration import TRAIN, UNSEEN, scene_slug
+from avp_experiment.plots import WIDTH_IN, Drawn, Missing, new_figure
+from avp_experiment.results import PICTURES, Episode, Results, floor_of
+from avp_habitat.metrics import FIGURES
 from avp_habitat.poses import heading
-from avp_habitat.rollout import format as rollout_format
-from avp_habitat.rollout.images import read_numbers, read_rgb
+from avp_habitat.rollout.images import read_rgb
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-
 NOT_NAVIGABLE, NEVER = 0, 1
 """Numbers of a floor; one of 1 + t was first observed by view t."""
-_POSE_COLUMNS = ("x_m", "z_m", "yaw_rad")
-
-
-def floor_map(folder: Path) -> dict[str, Any] | None:
-    """The map of a rollout as `results.json` keeps it; None for a rollout that was written without its floor.
-
-    Args:
-        folder: of the rollout.
-
-    Raises:
-        RolloutError: the folder, its floor or its `steps.csv` cannot be used.
-    """
-    rollout = rollout_format.read_rollout(folder)
-    if rollout.floor is None:
-        return None
-    numbers = read_numbers(rollout.floor.picture)
-    return {
-        "cell_m": rollout.floor.cell_m,
-        "origin_m": list(rollout.floor.origin_m),
-        "shape": list(rollout.floor.shape),
-        "floor": base64.b64encode(zlib.compress(numbers.astype("<u2").tobytes(), 9)).decode("ascii"),
-        "path": _path(rollout),
-    }
-
-
-def floor_of(entry: dict[str, Any]) -> NDArray[np.uint16]:
-    """`(rows, columns)` numbers of a map, as its rollout's `floor.png` holds them.
-
-    Raises:
-        AVPError: the entry is damaged.
-    """
-    try:
-        packed = zlib.decompress(base64.b64decode(entry["floor"], validate=True))
-        return np.frombuffer(packed, dtype="<u2").reshape(entry["shape"]).astype(np.uint16)
-    except (KeyError, TypeError, ValueError, zlib.error) as error:
-        raise AVPError(f"a map of the results cannot be read: {error}") from None
-
-
-def _path(rollout: rollout_format.Rollout) -> list[list[float]]:
-    """`[x, z, yaw]` after each step, in metres and radians."""
-    path = rollout.folder / "steps.csv"
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = [[round(float(row[name]), 4) for name in _POSE_COLUMNS] for row in csv.DictReader(file)]
-    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
-        raise RolloutError(
-            f"{path}: expected x_m, z_m and yaw_rad of every step, could not read them: {error!r}"
-        ) from None
-    if not np.isfinite(rows).all():
-        raise RolloutError(f"{path}: expected finite positions and angles, found others")
-    return rows
-
-
 DEFAULT_MAPS = ("heuristic", "coverage", "proposed")
 """Methods of figure 5."""
 DEFAULT_RENDERS = ("heuristic", "survey", "coverage", "proposed", "surface")
 """Methods of figure 6, as far as they are there; else the first ones."""
-PICTURES = "pictures"
 _ARROW_M = 0.22
-_UNSEEN_COLOUR, _OUTSIDE_COLOUR = "#C9CCD2", "#FFFFFF"
+_UNSEEN_COLOUR = "#C9CCD2"
 _PATH_COLOUR = "#B22234"
 _COLUMNS = 5
 
 
-def maps(results: Results, methods: Sequence[str] = DEFAULT_MAPS) -> Made:
+def maps(results: Results, methods: Sequence[str] = DEFAULT_MAPS) -> Drawn:
     """Figure 5: episodes from above, a row for the first scene of training and one for the first unseen one."""
     drawn = {(one.method, one.key[0]): one for one in results.rollouts if one.floor is not None}
-    scenes = [names[0] for role in ("train", "unseen") if (names := results.scenes(role))]
+    scenes = [names[0] for role in (TRAIN, UNSEEN) if (names := results.scenes(role))]
     scenes = [scene for scene in scenes if any((method, scene) in drawn for method in methods)]
     shown = [method for method in methods if any((method, scene) in drawn for scene in scenes)]
     if not shown:
         raise Missing(f"no episode of {', '.join(methods)} has a map")
     numbers = {which: floor_of(dict(one.floor or {})) for which, one in drawn.items() if which[0] in shown}
     last = max(int(floor.max()) - 1 for floor in numbers.values())
-    tallest = [max(_height_share(numbers[m, scene]) for m in shown if (m, scene) in numbers) for scene in scenes]
+    tallest = []
+    for scene in scenes:
+        shapes = [numbers[method, scene].shape for method in shown if (method, scene) in numbers]
+        tallest.append(max(rows / columns for rows, columns in shapes))
     width_in = (WIDTH_IN - 1.2) / len(shown)
     picture = new_figure(min(11.0, sum(share * width_in + 0.55 for share in tallest)))
     panels = picture.subplots(len(scenes), len(shown), squeeze=False, gridspec_kw={"height_ratios": tallest})
@@ -122,10 +65,10 @@ def maps(results: Results, methods: Sequence[str] = DEFAULT_MAPS) -> Made:
         "view that first observed them, grey: never observed. Red: the path; white dot: first view, red dot: last; "
         "arrows: where the camera faced."
     )
-    return Made(picture, caption + note)
+    return Drawn(picture, caption + note)
 
 
-def same_views(results: Results, role: str) -> Made:
+def same_views(results: Results, role: str) -> Drawn:
     """Figure 6: held-out views and what the reconstructions of some methods make of them, each with its PSNR."""
     scenes = results.scenes(role)
     if not scenes:
@@ -146,20 +89,16 @@ def same_views(results: Results, role: str) -> Made:
             psnr = f"{scores[name]:.1f} dB" if name in scores else f"view {number}" if name == "truth" else ""
             axes.set_title(head + psnr, fontsize=9)
             if name in named:
-                axes.imshow(_picture(named[name]), interpolation="nearest")
+                axes.imshow(read_rgb(named[name]), interpolation="nearest")
     left_out = [method for method in there if method not in columns]
     caption = (
         f"Held-out views {', '.join(map(str, found))} of {scene}: truth, and renders from the reconstructions of whole "
         "episodes (seed 0, first start), each with this view's PSNR."
     )
-    return Made(picture, caption + (f" Not shown: {', '.join(left_out)}." if left_out else ""))
+    return Drawn(picture, caption + (f" Not shown: {', '.join(left_out)}." if left_out else ""))
 
 
-def _height_share(floor: np.ndarray) -> float:
-    return floor.shape[0] / floor.shape[1]
-
-
-def _draw_map(axes: "Axes", rollout: Rollout, numbers: np.ndarray, last: int) -> Any:
+def _draw_map(axes: "Axes", rollout: Episode, numbers: np.ndarray, last: int) -> Any:
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
 
@@ -176,53 +115,34 @@ def _draw_map(axes: "Axes", rollout: Rollout, numbers: np.ndarray, last: int) ->
     ahead = heading(path[:, 2])[:, [0, 2]]
     axes.plot(path[:, 0], path[:, 1], color="white", linewidth=3.2)
     axes.plot(path[:, 0], path[:, 1], color=_PATH_COLOUR, linewidth=1.6)
-    arrows: dict[str, Any] = {
-        "angles": "xy",
-        "scale_units": "xy",
-        "scale": 1 / _ARROW_M,
-        "width": 0.0035,
-        "headwidth": 4,
-    }
-    axes.quiver(path[:, 0], path[:, 1], ahead[:, 0], ahead[:, 1], color="black", zorder=4, **arrows)
+    arrows: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "width": 0.0035, "headwidth": 4}
+    axes.quiver(*path[:, :2].T, *ahead.T, scale=1 / _ARROW_M, color="black", zorder=4, **arrows)
     for place, colour in ((path[0], "white"), (path[-1], _PATH_COLOUR)):
         axes.plot(*place[:2], "o", color=colour, markeredgecolor="black", markersize=6, zorder=5)
-    axes.set_title(
-        f"{rollout.method}: {len(path)} views, {100 * rollout.metrics['coverage']:.0f} % coverage", fontsize=9
-    )
+    covered = FIGURES["coverage"].scale * rollout.metrics["coverage"]
+    axes.set_title(f"{rollout.method}: {len(path)} views, {covered:.0f} % coverage", fontsize=9)
     axes.tick_params(labelsize=8)
-    axes.set_facecolor(_OUTSIDE_COLOUR)
+    axes.set_facecolor("white")
     axes.set_aspect("equal")
     return image
 
 
 def _pictures_by_view(results: Results, scene: str) -> dict[int, dict[str, Path]]:
     """Held-out views that have a render, by number: the truth's file, then those of methods in order."""
-    slug = Path(scene).stem.replace(":", "_")
+    slug = scene_slug(scene)
     found: dict[int, dict[str, Path]] = {}
     for truth in sorted((results.folder / PICTURES).glob(f"{slug}-truth-*.png")):
         number = truth.stem.rpartition("-")[2]
-        named = {"truth": truth} | {
-            method: path
-            for method in results.methods
-            if (path := truth.with_name(f"{slug}-{method}-{number}.png")).is_file()
-        }
-        if number.isdigit() and len(named) > 1:
-            found[int(number)] = named
+        files = {method: truth.with_name(f"{slug}-{method}-{number}.png") for method in results.methods}
+        renders = {method: path for method, path in files.items() if path.is_file()}
+        if number.isdigit() and renders:
+            found[int(number)] = {"truth": truth} | renders
     if not found:
         raise Missing(f"no picture of a held-out view of {scene} with a render of it in {PICTURES}/")
     return dict(sorted(found.items()))
 
 
 def _view_scores(results: Results, scene: str, number: int) -> dict[str, float]:
-    def shown(one: Reconstruction) -> bool:
-        return one.whole and one.key == (scene, 0, 0) and number < len(one.psnr_by_view)
-
-    found = {one.method: one.psnr_by_view[number] for one in results.reconstructions if shown(one)}
+    whole = [one for one in results.reconstructions if one.whole and one.key == (scene, 0, 0)]
+    found = {one.method: one.psnr_by_view[number] for one in whole if number < len(one.psnr_by_view)}
     return {method: psnr for method, psnr in found.items() if psnr is not None}
-
-
-def _picture(path: Path) -> np.ndarray:
-    try:
-        return read_rgb(path)
-    except (OSError, ValueError, SyntaxError) as error:
-        raise AVPError(f"{path}: expected a PNG, could not read it: {error}") from None
