@@ -159,7 +159,8 @@ REWARDS: dict[str, RewardFunction] = {
     "surface": surface,
 }
 """What is built in, by name."""
-REWARD_NAMES = tuple(REWARDS)
+REWARDS_HELP = f"{', '.join(REWARDS)} or MODULE:FUNCTION"
+"""Help of the option `--reward`."""
 
 
 def find_reward(reward: str | RewardFunction) -> RewardFunction:
