@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from avp_habitat import metrics
 from avp_habitat.metrics import FIGURES, Figure
+from avp_habitat.plugins import name_of
 from avp_habitat.policies.registry import check_policy, make_policy, make_policy_env, steps_of
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.simulators.registry import make_simulator
@@ -144,12 +145,12 @@ class PolicyRunner:
     def result(self, episodes: Sequence[Episode], seed: int) -> PolicyResult:
         """At least one episode of this policy, stacked; the first one started from `seed`, the next from `seed + 1`."""
         return PolicyResult(
-            policy=self.name,
+            policy=name_of(self.name),
             seeds=seed + np.arange(len(episodes)),
             curve=np.stack([episode.curve for episode in episodes]),
             figures={name: np.array([each.figures[name] for each in episodes]) for name in episodes[0].figures},
             training_run=getattr(self._policy, "avp_mlflow_run_id", None),
-            observation=self.env.settings.observation,
+            observation=name_of(self.env.settings.observation),
         )
 
 
