@@ -120,14 +120,17 @@ class _Buffers:
                     f"file whose buffers hold {most} bytes"
                 )
             values = np.zeros(shape, dtype)
-        if (sparse := accessor.sparse) is not None:
+        if accessor.sparse is not None:
             values = values.copy()
-            rows = self._list(sparse.indices, np.dtype(_COMPONENT[sparse.indices.componentType]), sparse.count)
-            values[rows] = self._list(sparse.values, dtype, sparse.count * shape[1]).reshape(-1, shape[1])
+            self._put_sparse(accessor.sparse, values)
         return _fractions(values) if accessor.normalized else values
 
-    def _list(self, entry: Any, dtype: np.dtype, count: int) -> NDArray:
-        return np.frombuffer(self.view(entry.bufferView), dtype, count, entry.byteOffset or 0)
+    def _put_sparse(self, sparse: Any, values: NDArray) -> None:
+        (where, what), count = (sparse.indices, sparse.values), sparse.count
+        kind = np.dtype(_COMPONENT[where.componentType])
+        rows = np.frombuffer(self.view(where.bufferView), kind, count, where.byteOffset or 0)
+        new = np.frombuffer(self.view(what.bufferView), values.dtype, count * values.shape[1], what.byteOffset or 0)
+        values[rows] = new.reshape(count, -1)
 
     def _buffer(self, index: int) -> bytes:
         if index not in self._content:

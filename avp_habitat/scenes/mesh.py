@@ -247,7 +247,7 @@ def _is_bent(a: NDArray, b: NDArray, c: NDArray, d: NDArray) -> NDArray[np.bool_
 
 def _not_convex(
     some: NDArray, lengths: NDArray, start: NDArray, corners: NDArray, positions: NDArray
-) -> Iterator[tuple[int, NDArray[np.float64], NDArray[np.float64]]]:
+) -> Iterator[tuple[int, NDArray, NDArray]]:
     """Index, `(n, 3)` corners and normal of each polygon with a corner that turns the wrong way."""
     of = np.repeat(np.arange(len(some)), lengths)
     end = np.cumsum(lengths)
