@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 
 @cache
-def say_once(scene: str, text: str) -> None:
+def warn_once(scene: str, text: str) -> None:
     """Log a warning about a scene, one line that Python shows on stderr, once in a process.
 
     Args:
