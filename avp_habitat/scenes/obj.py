@@ -8,7 +8,7 @@ import numpy as np
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles, decode_picture
-from avp_habitat.scenes.mesh import TexturedMesh, warn_once, triangulate
+from avp_habitat.scenes.mesh import TexturedMesh, triangulate, warn_once
 
 _MOST = 2**31 - 1
 """What an index of 32 bits can hold."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles, decode_picture
-from avp_habitat.scenes.mesh import TexturedMesh, warn_once, triangulate
+from avp_habitat.scenes.mesh import TexturedMesh, triangulate, warn_once
 
 _CODES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _CODES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
