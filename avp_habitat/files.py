@@ -1,27 +1,134 @@
-"""A folder of results that exists only when it is whole."""
+"""Files and folders of results that exist only when they are whole."""
 
 import os
+import secrets
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 
 from avp_habitat.errors import AVPError, UsageError
 
 
-def check_writable(path: Path, *, failure: type[AVPError] = AVPError) -> None:
+def check_new(path: Path, *, option: str = "") -> None:
+    """Refuse a path that exists.
+
+    Args:
+        path: of a new file or folder.
+        option: the command's option that gave it, for the message, for example `--out`.
+
+    Raises:
+        UsageError: there is something, be it a dangling link.
+    """
+    if path.exists() or path.is_symlink():
+        raise UsageError(f"{_named(path, option)}: exists already; choose another name or remove it")
+
+
+def check_writable(path: Path, *, failure: type[AVPError] = AVPError, option: str = "--out") -> None:
     """Refuse a result's path before long work; what is made to find out is removed again.
 
     Args:
-        path: of a new file or folder, as `--out` gave it.
+        path: of a new file or folder.
         failure: what is raised.
+        option: as for `check_new`.
     """
     above = next(folder for folder in path.absolute().parents if folder.exists())
     try:
         with tempfile.TemporaryDirectory(prefix=".avp-", dir=above):
             pass
     except OSError as error:
-        raise failure(f"--out {path}: cannot write there: {above}: {error.strerror or error}") from None
+        raise failure(f"{_named(path, option)}: cannot write there: {above}: {error.strerror or error}") from None
+
+
+@contextmanager
+def atomic_file(
+    path: str | Path, *, replace: bool = True, failure: type[AVPError] | None = None, option: str = ""
+) -> Iterator[Path]:
+    """A context in which a file is written under another name; it gets its own when the context ends without an error.
+
+    A reader, a second writer or a power cut sees the old file or the new one, never a part. Missing folders above it
+    are made. The temporary name is hidden, in the same folder, and ends in the same suffix.
+
+    Args:
+        path: the final name.
+        replace: whether a file of that name is replaced; else it is refused, at the start and at the end.
+        failure: what to raise in place of an `OSError`, also of one raised in the context; None lets those through.
+        option: as for `check_new`.
+
+    Yields:
+        Where to write.
+
+    Raises:
+        UsageError: the file exists and is not to be replaced.
+    """
+    path = Path(path)
+    if not replace:
+        check_new(path, option=option)
+    partial = _partial(path)
+    with _failing_as(failure, _named(path, option)):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield partial
+            with partial.open("rb") as file:
+                os.fsync(file.fileno())
+            if not replace:
+                check_new(path, option=option)
+            partial.replace(path)
+        finally:
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(path: str | Path, *, failure: type[AVPError] | None = None, option: str = "") -> Iterator[Path]:
+    """A context in which a folder is filled under another name; it gets its own when the context ends without an error.
+
+    An error or Ctrl-C removes what was written.
+
+    Args:
+        path: the final name; must not exist. Missing folders above it are made.
+        failure: what to raise in place of an `OSError`, also of one raised in the context; None lets those through.
+        option: as for `check_new`.
+
+    Yields:
+        The temporary folder, empty.
+
+    Raises:
+        UsageError: the folder exists, now or at the end.
+    """
+    path = Path(path)
+    check_new(path, option=option)
+    partial = _partial(path)
+    with _failing_as(failure, _named(path, option)):
+        try:
+            partial.mkdir(parents=True)
+            yield partial
+            if path.exists():
+                raise UsageError(f"{_named(path, option)}: another program made it meanwhile; nothing was replaced")
+            partial.rename(path)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+
+def _named(path: Path, option: str) -> str:
+    return f"{option} {path}".lstrip()
+
+
+def _partial(path: Path) -> Path:
+    # Libraries choose a file's format by its suffix, which therefore stays the last part of the name.
+    return path.with_name(f".{path.stem}.partial-{secrets.token_hex(4)}{path.suffix}")
+
+
+@contextmanager
+def _failing_as(failure: type[AVPError] | None, named: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if failure is None:
+            raise
+        raise failure(f"{named}: cannot write there: {error.strerror or error}") from error
 
 
 class NewFolder:

@@ -1,33 +1,110 @@
 """Figures of episodes and rollouts, what their names mean, and means with their confidence intervals."""
 
+import math
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any, Literal
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from avp_habitat.sight.visibility import ALIKE_DEG, ALIKE_DISTANCE, PARALLAX_DEG
+from avp_habitat import plugins
+from avp_habitat.errors import UsageError
 
 Float = NDArray[np.floating]
 
-TERMS = {
-    "coverage": "share of the navigable floor that some picture shows",
-    "views": "pictures taken, one for each step",
-    "CpV": "coverage per view, mean coverage over mean number of views",
-    "EI": "efficiency index, coverage over the number of pictures",
-    "ANND": "mean distance from each camera to the nearest other one, small where places repeat",
-    "redundant views": "like an earlier one in place and direction",
-    "stop": "the policy itself ended the episode, with enough coverage",
-    "path length": "metres walked",
-    "held-out views": "pictures of the room that no reconstruction is trained on",
-    "visibility": "share of the held-out views' pixels whose surface a captured picture shows",
-    "2 frames": "that, by at least two pictures",
-    "3 frames": "that, by at least three pictures",
-    "alike": f"that, within {ALIKE_DEG:g} degrees of the held-out ray and at most {ALIKE_DISTANCE:g} times as far away",
-    "parallax": f"that, along two rays at least {PARALLAX_DEG:g} degrees apart, which fixes the depth",
-    "weighted": "that, weighted by how much the best ray is like the held-out one",
-    "PSNR": "likeness of rendered and true held-out views in dB, higher is better",
-    "SSIM": "likeness of their structure, 1 is equal",
-    "LPIPS": "difference as a network sees it, 0 is equal",
+
+ALIKE_DEG = 60.0
+"""A frame sees a surface as the held-out view does when its ray is turned by no more than this, degrees."""
+ALIKE_DISTANCE = 2.0
+"""And when it stands no more than this many times as far away."""
+PARALLAX_DEG = 10.0
+"""Rays this far apart show how far away a surface is, degrees."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """How a figure of an episode, a rollout or a reconstruction is called and shown, wherever it is shown."""
+
+    name: str
+    """Its key in `info["avp_episode"]` and rollout.json; MLflow has it as `eval/NAME`, SB3's logger as `avp/NAME`."""
+    title: str
+    """For people, without the unit."""
+    unit: str = ""
+    """Of the shown number."""
+    scale: float = 1.0
+    """The shown number by the stored one: 100 for percent."""
+    digits: int = 1
+    """After the point."""
+    better: Literal["higher", "lower"] | None = None
+    """Which direction is the better one; None where there is no saying."""
+    meaning: str = ""
+    """In one line."""
+
+    @property
+    def heading(self) -> str:
+        """Title with unit, as `coverage [%]`."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+    def text(self, value: float, half_width: float = math.nan) -> str:
+        """A stored value as shown, with ± half an interval where that is known, without the unit."""
+        shown = f"{self.scale * value:.{self.digits}f}"
+        return shown if math.isnan(half_width) else f"{shown} ± {abs(self.scale) * half_width:.{self.digits}f}"
+
+
+def _visibility(name: str, title: str, meaning: str) -> Figure:
+    return Figure(f"visibility{name}", title, "%", 100, better="higher", meaning=meaning)
+
+
+_ALIKE = f"that, within {ALIKE_DEG:g} degrees of the held-out ray and at most {ALIKE_DISTANCE:g} times as far away"
+_PARALLAX = f"that, along two rays at least {PARALLAX_DEG:g} degrees apart, which fixes the depth"
+_SEEN = "share of the held-out views' pixels whose surface a captured picture shows"
+_SHARE = "share of the navigable floor that some picture shows"
+_ALL = (
+    Figure("coverage", "coverage", "%", 100, better="higher", meaning=_SHARE),
+    Figure("coverage_area", "coverage, mean over views", "%", 100, better="higher"),
+    Figure("views", "views", better="lower", meaning="pictures taken, one for each step"),
+    Figure("stopped", "stop", "%", 100, meaning="the policy itself ended the episode, with enough coverage"),
+    Figure("cpv", "CpV", "%/view", 1, 2, "higher", "coverage per view, mean coverage over mean number of views"),
+    Figure(
+        "annd_m",
+        "ANND",
+        "m",
+        1,
+        3,
+        meaning="mean distance from each camera to the nearest other one, small where places repeat",
+    ),
+    Figure("ei", "EI", "%/view", 100, 2, "higher", "efficiency index, coverage over the number of pictures"),
+    Figure("path_length_m", "path length", "m", 1, 2, meaning="metres walked"),
+    Figure("collisions", "collisions", better="lower", meaning="forward moves that were blocked"),
+    Figure("redundant_views", "redundant views", better="lower", meaning="like an earlier one in place and direction"),
+    Figure(
+        "redundant_share",
+        "redundant views",
+        "%",
+        100,
+        better="lower",
+        meaning="like an earlier one in place and direction",
+    ),
+    Figure("surface", "surface", "%", 100, better="higher", meaning="how well the scene's surface was seen"),
+    _visibility("", "visibility", _SEEN),
+    _visibility("_2_frames", "2 frames", "that, by at least two pictures"),
+    _visibility("_3_frames", "3 frames", "that, by at least three pictures"),
+    _visibility("_alike", "alike", _ALIKE),
+    _visibility("_parallax", "parallax", _PARALLAX),
+    _visibility("_weighted", "weighted", "that, weighted by how much the best ray is like the held-out one"),
+    Figure("psnr", "PSNR", "dB", 1, 2, "higher", "likeness of rendered and true held-out views in dB"),
+    Figure("ssim", "SSIM", "", 1, 3, "higher", "likeness of their structure, 1 is equal"),
+    Figure("lpips", "LPIPS", "", 1, 3, "lower", "difference as a network sees it, 0 is equal"),
+)
+FIGURES = {figure.name: figure for figure in _ALL}
+"""The suite's own figures by name, in the order in which tables show them."""
+TERMS = {figure.title: figure.meaning for figure in _ALL if figure.meaning} | {
+    "held-out views": "pictures of the room that no reconstruction is trained on"
 }
-"""What the figures' names mean, in one line each: tables, pages and options say it with these words."""
+"""What the titles mean, in one line each: tables, pages and options say it with these words."""
 
 
 def explained(*terms: str) -> str:
@@ -37,6 +114,81 @@ def explained(*terms: str) -> str:
         *terms: of `TERMS`.
     """
     return "; ".join(f"{term}: {TERMS[term]}" for term in terms)
+
+
+METRICS_HELP = "further metrics: names that other distributions register, or MODULE:FUNCTION"
+"""What a command line says of its option for metrics."""
+Of = Literal["episode", "rollout"]
+MetricFunction = Callable[[Any], float]
+"""A figure of an episode's `Trajectory` or of a `Rollout`, with what `metric` declares about it."""
+
+
+def metric(figure: Figure, *, of: Of = "episode") -> Callable[[MetricFunction], MetricFunction]:
+    """Decorator of a function that computes one more figure.
+
+    Args:
+        figure: how it is called and shown; its name may not be one of `FIGURES`.
+        of: what the function takes: the `Trajectory` of a finished episode, or a `Rollout` with its pictures.
+    """
+    return plugins.declares(figure=figure, of=of)
+
+
+_found: dict[str, Figure] = {}
+"""Of the metrics that this process has found, for the tables that show them."""
+
+
+def find_metrics(chosen: Sequence[str | MetricFunction]) -> list[Any]:
+    """The functions behind the names of metrics: `module:function`, or what another distribution registers.
+
+    Raises:
+        UsageError: there is no such metric, it declares no figure, or two figures have one name.
+    """
+    found = [plugins.find("avp.metrics", name, {}) for name in chosen]
+    taken = set(FIGURES)
+    for name, function in zip(chosen, found, strict=True):
+        said = plugins.name_of(name)
+        figure = getattr(function, "figure", None)
+        if not (callable(function) and isinstance(figure, Figure)):
+            raise UsageError(
+                f"metric {said!r}: expected a function that `metric(Figure(...))` decorates, got {function!r}"
+            )
+        if figure.name in taken:
+            raise UsageError(f"metric {said!r}: there is a figure named {figure.name!r} already; choose another name")
+        taken.add(figure.name)
+        _found[figure.name] = figure
+    return found
+
+
+def measured(chosen: Iterable[str | MetricFunction], of: Of, thing: Any) -> dict[str, float]:
+    """What the chosen metrics of an episode or of a rollout give, by the figures' names.
+
+    Raises:
+        UsageError: as `find_metrics`, or a metric gives no finite number.
+    """
+    values = {}
+    for function in find_metrics(tuple(chosen)):
+        if function.of == of:
+            value = function(thing)
+            if not isinstance(value, Real) or not math.isfinite(value):
+                raise UsageError(f"metric {function.figure.name!r}: expected one finite number, got {value!r}")
+            values[function.figure.name] = float(value)
+    return values
+
+
+def figures() -> dict[str, Figure]:
+    """All figures by name: the suite's, those of metrics found in this process, and those that distributions register.
+
+    A registered metric that cannot be imported is left out: what it measured is then shown by its key.
+    """
+    for name in plugins.names("avp.metrics", ()):
+        with suppress(UsageError):
+            find_metrics((name,))
+    return FIGURES | _found
+
+
+def figure_of(name: str) -> Figure:
+    """How a figure is called and shown; one that nobody here knows, by its key."""
+    return figures().get(name) or Figure(name, name.replace("_", " "), digits=3)
 
 
 def coverage(observed: NDArray[np.bool_], navigable: NDArray[np.bool_]) -> float:

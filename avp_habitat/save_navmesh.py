@@ -1,8 +1,6 @@
 """`python -m avp_habitat.save_navmesh`: keep Habitat-Sim's NavMesh of a scene as a file, for both simulators."""
 
-import os
 import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,6 +9,7 @@ from tyro.conf import arg
 
 from avp_habitat import command
 from avp_habitat.errors import SceneError, UsageError
+from avp_habitat.files import atomic_file, check_new
 from avp_habitat.scenes.location import HELP, UP_HELP
 
 
@@ -33,20 +32,15 @@ def save_navmesh(scene: str | Path, out: Path, *, gpu: int | None = None, up: st
     """
     if out.suffix != ".navmesh":
         raise UsageError(f"{out}: expected a name that ends in .navmesh")
-    if out.exists():
-        raise UsageError(f"{out}: exists already; remove it or choose another name")
+    check_new(out)
     if not out.parent.is_dir():
         raise UsageError(f"{out}: there is no folder {out.parent}")
     from avp_habitat.simulators.habitat import HabitatSimulator
 
     simulator = HabitatSimulator(scene, gpu=gpu, up=up)
     try:
-        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
-            made = Path(folder) / out.name
-            simulator.save_navmesh(made)
-            os.replace(made, out)
-    except OSError as error:
-        raise SceneError(f"{out}: cannot be written: {error.strerror}") from error
+        with atomic_file(out, replace=False, failure=SceneError) as partial:
+            simulator.save_navmesh(partial)
     finally:
         simulator.close()
     return simulator.area.area_m2

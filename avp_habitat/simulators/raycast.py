@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.poses import Intrinsics, pixel_directions
-from avp_habitat.sight.coverage import pairs_in_image
+from avp_habitat.sight.rules import pairs_in_image
 from avp_habitat.simulators.base import Frames
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class RaycastSimulator:
 
     @cached_property
     def _area(self) -> "NavigableArea":
-        from avp_habitat.navigation.area import build_area
+        from avp_habitat.navigation.build import build_area
         from avp_habitat.navigation.settings import NavigationSettings
         from avp_habitat.scenes.mesh import without_holes
 
