@@ -12,19 +12,9 @@ from scipy import stats
 from tracking import mlflow_home
 
 from avp_habitat import command
-from avp_habitat.tracking import compare as compare_command
-from avp_habitat.tracking.comparison import COLUMNS, RunFigures, collect_runs, compare, markdown
-from avp_habitat.tracking.view import (
-    KIND_TAG,
-    NOTE_TAG,
-    RECONSTRUCTIONS,
-    VERSION_TAG,
-    VIEW_TAG,
-    VIEWS,
-    path_of,
-    prepare_experiment,
-    run_colour,
-)
+from avp_habitat.tracking.compare import COLUMNS, compare, main, markdown
+from avp_habitat.tracking.names import NOTE_TAG, PAGE_TAG, VIEW_TAG, VIEWS_TAG
+from avp_habitat.tracking.view import RECONSTRUCTIONS, VIEWS, path_of, prepare_experiment, run_colour
 
 
 @pytest.fixture
@@ -56,7 +46,7 @@ def experiment(store):
 
 
 def run_command(*words):
-    return command.run(compare_command.main, [str(word) for word in words])
+    return command.run(main, [str(word) for word in words])
 
 
 def parsed(table):
@@ -66,7 +56,7 @@ def parsed(table):
 
 
 def test_the_table_holds_means_and_students_intervals_by_scene_policy_and_method(store, experiment):
-    rows = parsed(markdown(compare(collect_runs(store, experiment))))
+    rows = parsed(markdown(compare(store, experiment)))
     assert [(row["scene"], row["policy"], row["method"], row["runs"]) for row in rows] == [
         ("other.glb", "a", "nerf", "1"),
         ("room.glb", "a", "avp-nerfacto", "2"),
@@ -86,20 +76,19 @@ def test_a_rollout_counts_once_beside_its_reconstruction(store):
     rollout = make_run(store, found, figures, kind="rollout", **room)
     make_run(store, found, {**figures, "psnr": 24.0}, kind="reconstruction", method="nerf", rollout_run=rollout, **room)
     make_run(store, found, {"coverage": 0.4, "views": 20}, kind="rollout", **room)
-    rows = parsed(markdown(compare(collect_runs(store, found))))
+    rows = parsed(markdown(compare(store, found)))
     assert [(row["method"], row["runs"], row["views"], row["visibility [%]"]) for row in rows] == [
         ("nerf", "1", "40.0", "62.5"),
         ("rollout", "1", "20.0", "–"),
     ]
 
 
-def test_the_best_reconstruction_of_a_scene_comes_first():
-    def run(policy, **metrics):
-        return RunFigures(policy, policy, "room", "nerf", {f"eval/{name}": value for name, value in metrics.items()})
-
-    runs = [run("none", coverage=0.99, views=9), run("poor", coverage=0.9, views=9, psnr=10.0)]
-    found = compare([*runs, run("good", coverage=0.1, views=9, psnr=30.0)])
-    assert [method.policy for method in found] == ["good", "poor", "none"]
+def test_the_best_reconstruction_of_a_scene_comes_first(store):
+    found = store.create_experiment("avp")
+    make_run(store, found, {"coverage": 0.99, "views": 9}, policy="none", scene="room")
+    make_run(store, found, {"coverage": 0.9, "views": 9, "psnr": 10.0}, policy="poor", scene="room")
+    make_run(store, found, {"coverage": 0.1, "views": 9, "psnr": 30.0}, policy="good", scene="room")
+    assert [method.policy for method in compare(store, found)] == ["good", "poor", "none"]
 
 
 def test_the_command_keeps_one_run_and_renews_it(store, experiment, tmp_path, capsys):
@@ -118,7 +107,7 @@ def test_the_command_keeps_one_run_and_renews_it(store, experiment, tmp_path, ca
     assert run.data.tags["avp.scene"] == "other.glb, room.glb"
     assert json.loads(run.data.tags["mlflow.loggedArtifacts"]) == [{"path": "comparison.json", "type": "table"}]
     table = mlflow.artifacts.load_dict(f"runs:/{first}/comparison.json")
-    rows = [method.cells() for method in compare(collect_runs(store, experiment))]
+    rows = [method.cells() for method in compare(store, experiment)]
     assert table == {"columns": list(COLUMNS), "data": rows}
     assert len(rows) == 5
     assert "| c " in run.data.tags["mlflow.note.content"]
@@ -146,7 +135,7 @@ def test_the_picture_shows_the_policies_that_have_a_reconstruction_in_their_colo
     [
         (["--experiment", "apv"], 2, "unknown experiment 'apv': expected one of .*did you mean 'avp'"),
         (["--scene", "rom.glb"], 2, r"--scene: unknown scene 'rom\.glb': .*did you mean 'room\.glb'"),
-        (["--mlflow", "off"], 2, "--mlflow off: expected an address"),
+        (["--mlflow", "off"], 2, "--mlflow: expected an address or auto, got off"),
         (["--mlflow", "http://127.0.0.1:9"], 1, "MLflow at http://127.0.0.1:9 cannot be used"),
         (["--mlflow", "mango://here"], 1, "MLflow at mango://here cannot be used"),
         (["--out", "."], 2, "--out .: exists already"),
@@ -171,7 +160,7 @@ def test_an_experiments_page_is_prepared_once_and_then_left_to_people(store):
     assert prepare_experiment(store, experiment) == path_of(experiment)
     tags = store.get_experiment(experiment).tags
     assert {VIEW_TAG + view.key for view in VIEWS} <= tags.keys()
-    assert (tags[NOTE_TAG], tags[KIND_TAG]) == ("my words", "custom_model_development")
+    assert (tags[NOTE_TAG], tags[PAGE_TAG]) == ("my words", "custom_model_development")
     store.delete_experiment_tag(experiment, VIEW_TAG + VIEWS[2].key)
     store.set_experiment_tag(experiment, VIEW_TAG + VIEWS[0].key, "changed")
     prepare_experiment(store, experiment)
@@ -193,10 +182,10 @@ def test_a_cut_connection_is_made_good_by_the_next_preparation(store, monkeypatc
     monkeypatch.setattr(store, "set_experiment_tag", cut)
     assert prepare_experiment(store, experiment) == path_of(experiment)
     assert "its page could not be prepared: the line is dead" in caplog.text
-    assert VERSION_TAG not in store.get_experiment(experiment).tags
+    assert VIEWS_TAG not in store.get_experiment(experiment).tags
     monkeypatch.undo()
     prepare_experiment(store, experiment)
-    assert {VIEW_TAG + view.key for view in VIEWS} | {NOTE_TAG, VERSION_TAG} <= store.get_experiment(
+    assert {VIEW_TAG + view.key for view in VIEWS} | {NOTE_TAG, VIEWS_TAG} <= store.get_experiment(
         experiment
     ).tags.keys()
 

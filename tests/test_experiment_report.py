@@ -11,7 +11,7 @@ from PIL import Image
 from scipy import stats
 
 from avp_experiment.report import main, write_report
-from avp_experiment.stored import read_results
+from avp_experiment.results import read_results
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
 
@@ -301,12 +301,12 @@ BAD = {
     "half a rollout": (
         lambda folder: spoiled(folder, lambda v: v["rollouts"][2].pop("metrics")),
         1,
-        r"rollouts[2]: missing or damaged: KeyError('metrics')",
+        r"rollouts: missing or damaged: KeyError('metrics')",
     ),
     "a text for a number": (
         lambda folder: spoiled(folder, lambda v: v["reconstructions"][0].update(frames="many")),
         1,
-        "reconstructions[0]: missing or damaged",
+        "reconstructions: missing or damaged",
     ),
     "a damaged map": (
         lambda folder: spoiled(folder, lambda v: v["rollouts"][0]["map"].update(floor="####")),

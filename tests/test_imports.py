@@ -18,11 +18,12 @@ MAY_IMPORT = {
 LIGHT = (
     "errors",
     "metrics",
+    "plugins",
     "poses",
     "ranges",
     "rollout.format",
     "rollout.png",
-    "sight.coverage",
+    "sight.rules",
     "sight.visibility",
     "task.rewards",
     "task.trajectory",

@@ -15,11 +15,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from tracking import BreakingEnv, SmallEnv, mlflow_home, ppo
 from tracking_server import free_port
 
+from avp_habitat import command
 from avp_habitat.errors import UsageError
 from avp_habitat.provenance import flat
 from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.tracking import deliver
-from avp_habitat.tracking.names import find_run
+from avp_habitat.tracking.experiments import find_run
 from avp_habitat.tracking.stores import TrackingError
 from avp_sb3 import MetricsCallback, MLflowCallback
 from avp_sb3.callbacks.run_facts import hyperparameters, run_name
@@ -248,7 +249,7 @@ def test_a_training_goes_on_without_its_server_when_told_to(client, tmp_path):
     model.learn(64, callback=[MetricsCallback(), callback])
     assert callback.run_id.startswith("offline-")
     # The server that was meant never comes; the points can go elsewhere.
-    deliver.main(["--mlflow", client.tracking_uri])
+    assert command.run(deliver.main, ["--mlflow", client.tracking_uri]) == 0
     run = find_run(client, callback.run_id)
     assert run.info.status == "FINISHED"
     assert [point.step for point in client.get_metric_history(run.info.run_id, "avp/coverage")] == [64]

@@ -12,8 +12,8 @@ from PIL import Image as Files
 from stable_baselines3.common.logger import Figure, Image, Logger
 from tracking import mlflow_home
 
-from avp_habitat.tracking.names import Names, safe_name
-from avp_habitat.tracking.opening import NewRun, start_run
+from avp_habitat.tracking.names import SafeNames, safe_name
+from avp_habitat.tracking.run import NewRun, start_run
 from avp_sb3.callbacks.base import NOT_FOR, LoggedFile
 from avp_sb3.callbacks.mlflow import MLflowWriter
 
@@ -26,7 +26,7 @@ def test_any_name_becomes_one_that_mlflow_takes(name):
 
 @given(st.lists(st.text(max_size=6), unique=True))
 def test_different_names_stay_different(given_names):
-    names = Names()
+    names = SafeNames()
     safe = [names[name] for name in given_names]
     assert len(set(safe)) == len(safe)
     assert safe == [names[name] for name in given_names]

@@ -307,7 +307,7 @@ def test_a_required_extension_that_is_not_supported_is_named(tmp_path, name):
         (lambda j: j["accessors"][0].update(componentType=1), "component type 1"),
         (lambda j: j["nodes"].append({"children": [0]}) or j["nodes"][0].update(children=[0]), "two parents"),
         (lambda j: j["nodes"][0].update(mesh=3), "damaged: list index out of range"),
-        (lambda j: j["nodes"][0].update(rotation=[0, 0, 0, 0]), "zero quaternion"),
+        (lambda j: j["nodes"][0].update(rotation=[0, 0, 0, 0]), "zero norm quaternion"),
         (lambda j: j["meshes"][0]["primitives"][0].update(mode=1), "expected a mesh with triangles, found none"),
         (lambda j: j["scenes"][0].update(nodes=[]), "expected a mesh with triangles, found none"),
         (lambda j: j["asset"].update(version="1.0"), "expected glTF 2.0, got version 1.0"),

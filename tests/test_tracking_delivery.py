@@ -12,11 +12,13 @@ import pytest
 from mlflow import MlflowClient
 from tracking import mlflow_home
 
+from avp_habitat import command
 from avp_habitat.errors import UsageError
-from avp_habitat.tracking import deliver
+from avp_habitat.tracking.deliver import Deliver, main, recover
+from avp_habitat.tracking.experiments import find_run
 from avp_habitat.tracking.journal import Journal, spool_folder
-from avp_habitat.tracking.names import PARENT_TAG, find_run
-from avp_habitat.tracking.opening import NewRun, continue_run, recover, start_run
+from avp_habitat.tracking.names import PARENT_TAG
+from avp_habitat.tracking.run import NewRun, continue_run, start_run
 from avp_habitat.tracking.stores import TrackingError, address_of, shown
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -25,6 +27,10 @@ ROOT = Path(__file__).resolve().parent.parent
 @pytest.fixture
 def address(tmp_path, monkeypatch):
     return mlflow_home(tmp_path, monkeypatch)
+
+
+def deliver(*words):
+    main(command.parse(Deliver, words))
 
 
 def python(code, **options):
@@ -38,7 +44,7 @@ def points(address, run_id, name):
 
 KILLED = """
 import os, signal
-from avp_habitat.tracking.opening import NewRun, start_run
+from avp_habitat.tracking.run import NewRun, start_run
 run = start_run("sqlite:///mlflow.db", NewRun(), interval_s=1000)
 for step in range(50):
     run.metrics({"a": step / 2}, step)
@@ -114,41 +120,41 @@ def test_points_that_arrived_before_the_kill_are_not_doubled(address, tmp_path, 
 
 
 def test_the_command_sends_what_waits_and_says_so(address, killed, capsys):
-    deliver.main(["--list"])
+    deliver("--list")
     assert killed in capsys.readouterr().out
-    deliver.main([])
+    deliver()
     assert f"run {killed} at {address}: sent (KILLED, its program was killed)" in capsys.readouterr().out
     assert len(points(address, killed, "a")) == 50
-    deliver.main([])
+    deliver()
     assert "nothing waits" in capsys.readouterr().out
     with pytest.raises(UsageError, match="--spool nowhere: no such folder"):
-        deliver.main(["--spool", "nowhere"])
+        deliver("--spool", "nowhere")
 
 
 def test_the_command_keeps_what_it_cannot_send(address, killed, tmp_path, capsys):
     (tmp_path / "mlflow.db").rename(tmp_path / "away.db")
     with pytest.raises(TrackingError, match=r"1 of 1 runs could not be sent; they stay in .*mlflow-spool"):
-        deliver.main([])
+        deliver()
     assert not (tmp_path / "mlflow.db").exists()
     (tmp_path / "away.db").rename(tmp_path / "mlflow.db")
-    deliver.main([])
+    deliver()
     assert len(points(address, killed, "a")) == 50
 
 
 def test_a_run_that_was_deleted_can_be_restored_and_gets_its_points(address, killed, capsys, caplog):
     client = MlflowClient(address)
     client.delete_run(killed)
-    deliver.main([])
+    deliver()
     recover(spool_folder())
     client.restore_run(killed)
-    deliver.main(["--again"])
+    deliver("--again")
     assert len(points(address, killed, "a")) == 50
     assert client.get_run(killed).info.status == "KILLED"
 
 
 def test_a_live_run_is_left_to_its_own_program(address, capsys):
     run = start_run(address, NewRun())
-    deliver.main([])
+    deliver()
     assert "1 of 1 belong to programs that still run" in capsys.readouterr().out
     recover(spool_folder())
     assert MlflowClient(address).get_run(run.run_id).info.status == "RUNNING"
@@ -159,7 +165,7 @@ def test_a_live_run_is_left_to_its_own_program(address, capsys):
 
 WRITER = """
 import sys
-from avp_habitat.tracking.opening import NewRun, start_run
+from avp_habitat.tracking.run import NewRun, start_run
 run = start_run("sqlite:///new.db", NewRun("shared"), interval_s=0.01)
 for step in range(300):
     run.metrics({"a": step, "b": -step}, step)
@@ -210,7 +216,7 @@ def test_a_run_made_offline_is_made_once_whoever_asks(address):
     offline_id = run.run_id
     assert not run.close("FINISHED")
     assert find_run(MlflowClient(address), offline_id) is None
-    deliver.main(["--mlflow", address])
+    deliver("--mlflow", address)
     found = find_run(MlflowClient(address), offline_id)
     assert (found.info.run_name, found.info.status) == ("mine", "FINISHED")
     assert found.data.metrics == {"a": 1.0}
@@ -239,7 +245,7 @@ def test_addresses_are_shown_without_passwords():
 FULL = """
 import resource, signal
 from pathlib import Path
-from avp_habitat.tracking.opening import NewRun, start_run
+from avp_habitat.tracking.run import NewRun, start_run
 run = start_run("sqlite:///mlflow.db", NewRun(), interval_s=0.01)
 assert run.flush()
 soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)

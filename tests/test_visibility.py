@@ -28,7 +28,7 @@ from avp_habitat.sight.visibility import (
     visibility,
 )
 from avp_habitat.simulators.raycast import RaycastSimulator
-from avp_habitat.tracking.rollout_facts import figures
+from avp_habitat.tracking.rollout_run import figures
 
 CAMERA = Intrinsics.from_hfov(64, 48, hfov_deg=90)
 CORRIDOR = Corridor()

@@ -5,19 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.policies.planning import (
+from avp_habitat.policies.known_map import (
     FREE,
     OBSERVED,
     UNKNOWN,
     KnownMap,
-    PlanningPolicy,
     farthest_straight,
     route_to,
     shortest_walks,
     walkable,
 )
-from avp_habitat.policies.predicted_views import in_view, make_lens, should_look_down
-from avp_habitat.policies.reactive import Memory
+from avp_habitat.policies.planning import PlanningPolicy
+from avp_habitat.policies.predicted_views import Memory, in_view, make_lens, should_look_down
 from avp_habitat.poses import wrap_angle
 from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.settings import LOOK_DOWN, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT
@@ -114,7 +113,7 @@ class _Here:
         self._turn = np.radians(view.settings.turn_deg)
         self._forward = view.settings.forward_m / known.cell_m
         self._lens = make_lens(view.settings, known.cell_m)
-        self._half_view = np.arctan(self._lens.half_width)
+        self._half_view = np.radians(view.settings.hfov_deg) / 2
         self._navigable = known.navigable
         self._length, self._before = shortest_walks(self._navigable, self._at.astype(np.int64))
 

@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 
 from avp_habitat import poses
 from avp_habitat.errors import SceneError
+from avp_habitat.metrics import measured
 from avp_habitat.navigation.area import NavigableArea
+from avp_habitat.plugins import name_of
 from avp_habitat.poses import Intrinsics
 from avp_habitat.provenance import installed_versions
 from avp_habitat.rollout.drawing import draw_trajectory
+from avp_habitat.rollout.format import Rollout
 from avp_habitat.rollout.images import write_numbers, write_rgb
 from avp_habitat.rollout.seen import visibility_of
 from avp_habitat.rollout.writing import RolloutWriter
@@ -134,9 +137,11 @@ def publish_rollout(
     """
     write_rgb(writer.path("trajectory.png"), draw_trajectory(env.area, info["avp_trajectory"]))
     floor = _write_floor(env.area, info["avp_trajectory"], writer)
-    metrics = info["avp_episode"] | _visibility(writer)
+    frames, views = writer.views(heldout=False), writer.views(heldout=True)
+    rollout = Rollout(writer.path(""), _scene_and_task(env, heldout), writer.intrinsics, frames, views)
+    metrics = info["avp_episode"] | _visibility(rollout) | measured(env.settings.metrics, "rollout", rollout)
     about = {"policy": policy, "seed": seed, "metrics": metrics, "floor": floor, "mlflow_run_id": mlflow_run_id}
-    writer.publish(_scene_and_task(env, heldout) | about)
+    writer.publish(rollout.meta | about)
     return metrics
 
 
@@ -153,12 +158,11 @@ def _write_floor(area: NavigableArea, trajectory: Trajectory, writer: RolloutWri
     }
 
 
-def _visibility(writer: RolloutWriter) -> dict[str, float]:
+def _visibility(rollout: Rollout) -> dict[str, float]:
     """From the files, in whole millimetres, so that the figure is the one that a reader of the folder computes."""
-    heldout = writer.views(heldout=True)
-    if not heldout:
+    if not rollout.heldout:
         return {}
-    found = visibility_of(writer.views(heldout=False), heldout, writer.intrinsics).figures()
+    found = visibility_of(rollout.frames, rollout.heldout, rollout.intrinsics).figures()
     return {name: value for name, value in found.items() if name == "visibility"}
 
 
@@ -186,7 +190,7 @@ def _scene_and_task(env: AVPEnv, heldout: int) -> dict[str, Any]:
     return {
         "scene": {"name": env.scene_name, "sha256": env.scene_digest, **asdict(env.simulator.scene_frame)},
         "simulator": {"name": env.simulator.name, "version": env.simulator.version},
-        "reward": settings.reward,
+        "reward": name_of(settings.reward),
         "reward_constants": asdict(settings.constants),
         "budget": settings.budget,
         "actions": {

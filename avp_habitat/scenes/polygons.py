@@ -1,6 +1,6 @@
 """Polygons as triangles: fans where they are convex, ears cut off where they are not, as around a door in a wall."""
 
-from collections.abc import Callable
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,9 +41,13 @@ def triangulate(
         places[begin[turned]] = start[turned, None] + [1, 2, 3]
         places[begin[turned] + 1] = start[turned, None] + [1, 3, 0]
     for some in _portions(np.flatnonzero(lengths > 4)):
-        _cut(
-            some, lengths[some], start[some], begin[some], lambda at: positions[corners[at]].astype(np.float64), places
-        )
+        for polygon, points, normal in _not_convex(some, lengths[some], start[some], corners, positions):
+            if len(points) > _MOST_CORNERS:
+                raise ValueError(
+                    f"polygon {polygon + 1} is not convex and has {len(points)} corners; expected {_MOST_CORNERS} at "
+                    "most: export the scene with triangles"
+                )
+            places[begin[polygon] :][: len(points) - 2] = start[polygon] + _ears(points, normal)
     return places, polygons
 
 
@@ -54,47 +58,30 @@ def _portions(indices: NDArray[np.int64]) -> list[NDArray[np.int64]]:
 def _is_bent(a: NDArray, b: NDArray, c: NDArray, d: NDArray) -> NDArray[np.bool_]:
     """`(n,)` whether the diagonal from a to c lies outside of a quad: its halves face different ways."""
     with np.errstate(over="ignore", invalid="ignore"):
-        across = c - a
-        one, two = _crossed(b - a, across), _crossed(across, d - a)
+        one, two = np.cross(b - a, c - a), np.cross(c - a, d - a)
         whole = one + two
         least = np.minimum((one * whole).sum(axis=1), (two * whole).sum(axis=1))
         return least < -_STRAIGHT * (whole * whole).sum(axis=1)
 
 
-def _crossed(one: NDArray, two: NDArray) -> NDArray:
-    (x, y, z), (u, v, w) = one.T, two.T
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
-
-
-def _cut(
-    some: NDArray,
-    lengths: NDArray,
-    start: NDArray,
-    begin: NDArray,
-    points: Callable[[NDArray], NDArray[np.float64]],
-    places: NDArray[np.int64],
-) -> None:
-    """Replace the fans of those polygons that are not convex, in place."""
+def _not_convex(
+    some: NDArray, lengths: NDArray, start: NDArray, corners: NDArray, positions: NDArray
+) -> Iterator[tuple[int, NDArray[np.float64], NDArray[np.float64]]]:
+    """Index, `(n, 3)` corners and normal of each polygon with a corner that turns the wrong way."""
     of = np.repeat(np.arange(len(some)), lengths)
     end = np.cumsum(lengths)
     own = np.arange(len(of)) - (end - lengths)[of]
-    here, before, after = (points(start[of] + (own + step) % lengths[of]) - points(start[of]) for step in (0, -1, 1))
+    first = positions[corners[start]].astype(np.float64)[of]
+    here, before, after = (
+        positions[corners[start[of] + (own + step) % lengths[of]]].astype(np.float64) - first for step in (0, -1, 1)
+    )
     with np.errstate(over="ignore", invalid="ignore"):
-        crossed = _crossed(here, after)
-        normals = np.zeros((len(some), 3))
-        for axis in range(3):
-            normals[:, axis] = np.bincount(of, crossed[:, axis], len(some))
-        turns = (_crossed(here - before, after - here) * normals[of]).sum(axis=1)
+        crossed = np.cross(here, after)
+        normals = np.stack([np.bincount(of, crossed[:, axis], len(some)) for axis in range(3)], axis=1)
+        turns = (np.cross(here - before, after - here) * normals[of]).sum(axis=1)
         wrong = turns < -_STRAIGHT * (normals**2).sum(axis=1)[of]
-    count = np.bincount(of[wrong], minlength=len(some))
-    for index in np.flatnonzero(count):
-        if lengths[index] > _MOST_CORNERS:
-            raise ValueError(
-                f"polygon {some[index] + 1} is not convex and has {lengths[index]} corners; expected {_MOST_CORNERS} "
-                "at most: export the scene with triangles"
-            )
-        ears = _ears(here[end[index] - lengths[index] : end[index]], normals[index])
-        places[begin[index] : begin[index] + len(ears)] = start[index] + ears
+    for index in np.unique(of[wrong]):
+        yield int(some[index]), here[end[index] - lengths[index] : end[index]], normals[index]
 
 
 def _ears(corners: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.int64]:

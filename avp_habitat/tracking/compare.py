@@ -1,41 +1,57 @@
-"""`python -m avp_habitat.tracking.compare`: one table of an MLflow experiment's methods, kept there as a run."""
+"""`python -m avp_habitat.tracking.compare`: the policies of an MLflow experiment in one table."""
 
-import argparse
+import json
+import math
 import os
-import shlex
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlsplit
+
+from tyro.conf import UseAppendAction, arg
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
-from avp_habitat.metrics import explained
-from avp_habitat.tracking.comparison import (
-    KIND,
+from avp_habitat.files import NewFolder
+from avp_habitat.metrics import FIGURES, coverage_per_view, explained, mean_and_half_width
+from avp_habitat.tables import table
+from avp_habitat.tracking.experiments import DEFAULT_HELP, chosen_experiment, find_experiment
+from avp_habitat.tracking.names import (
+    COMPARISON,
+    EVALUATION,
     KIND_TAG,
+    MAX_TAG,
+    METHOD_TAG,
+    NOTE_TAG,
+    POLICY_TAG,
+    ROLLOUT_RUN_TAG,
     SCENE_TAG,
-    Method,
-    collect_runs,
-    columns,
-    compare,
-    markdown,
-    picture,
 )
-from avp_habitat.tracking.experiments import DEFAULT_HELP, find_experiment, meant
-from avp_habitat.tracking.stores import DEFAULT_ADDRESS, TrackingError, address_of, connect, first_line, shown
-from avp_habitat.tracking.view import MODEL_TRAINING, prepare_experiment
+from avp_habitat.tracking.stores import (
+    ADDRESS_HELP,
+    DEFAULT_ADDRESS,
+    TrackingError,
+    address_of,
+    connect,
+    first_line,
+    how_to_look,
+    shown,
+)
+from avp_habitat.tracking.view import MODEL_TRAINING, prepare_experiment, run_colour
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Experiment
 
 TABLE, MARKDOWN, PICTURE = "comparison.json", "comparison.md", "comparison.png"
-NAME = "comparison"
-_NOTE = "mlflow.note.content"
-_MAX_TAG = 5000
+_SHOWN = [FIGURES[name] for name in ("views", "coverage", "cpv", "visibility", "psnr", "ssim", "lpips")]
+COLUMNS = ("policy", "scene", "method", "runs", *(figure.heading for figure in _SHOWN))
+"""Of the table."""
+_MOST_RUNS = 50_000  # that MLflow gives in one answer
 _HOW_TO_READ = f"""
 More PSNR and SSIM are better, less LPIPS; fewer views are better. Means over the runs; ± is half of the 95 % interval.
 
@@ -43,56 +59,105 @@ More PSNR and SSIM are better, less LPIPS; fewer views are better. Means over th
 """
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m avp_habitat.tracking.compare",
-        description="Compare the policies of an MLflow experiment by their reconstructions and evaluations, print the "
-        "table, and keep it in the experiment as the run 'comparison', which is made once and then renewed.",
-    )
-    add = parser.add_argument
-    add("--experiment", metavar="NAME", help=f"of MLflow (default: {DEFAULT_HELP})")
-    add(
-        "--mlflow",
-        default="auto",
-        metavar="ADDRESS",
-        help=f"an MLflow address such as {DEFAULT_ADDRESS}; auto: MLFLOW_TRACKING_URI, or else {DEFAULT_ADDRESS} "
-        "(default: %(default)s)",
-    )
-    add("--scene", action="append", default=[], metavar="NAME", help="only this scene; give it again for more")
-    add("--out", type=Path, metavar="FOLDER", help="write table and picture to this folder, too; must not exist")
-    return parser
+@dataclass(frozen=True)
+class Method:
+    """One row: the runs of a policy in a scene, by one method."""
+
+    policy: str
+    """Who took the views."""
+    scene: str
+    """Where."""
+    method: str
+    """nerfstudio's method, or `evaluation`."""
+    runs: int
+    """How many."""
+    means: Mapping[str, float]
+    """By name of the figure; what no run has is missing."""
+    halves: Mapping[str, float]
+    """Half of the 95 % interval, where more than one run or episode tells of the spread."""
+
+    def cells(self) -> list[str]:
+        """As `COLUMNS` says."""
+        halves = {figure.name: self.halves.get(figure.name, math.nan) for figure in _SHOWN}
+        known = self.means
+        figures = [one.text(known[one.name], halves[one.name]) if one.name in known else "–" for one in _SHOWN]
+        return [self.policy, self.scene, self.method, str(self.runs), *figures]
 
 
-def _options(argv: Sequence[str]) -> argparse.Namespace:
-    options = _parser().parse_args(argv)
-    options.address = address_of(options.mlflow, default=DEFAULT_ADDRESS)
-    if options.address is None:
-        raise UsageError("--mlflow off: expected an address, for there is nothing to compare without MLflow's runs")
-    if options.out is not None and (options.out.exists() or options.out.is_symlink()):
-        raise UsageError(f"--out {options.out}: exists already; choose another name or remove it")
-    return options
+def compare(client: "MlflowClient", experiment_id: str) -> list[Method]:
+    """What an experiment's reconstructions, rollouts and evaluations (of its first 50,000 runs) say of each method.
+
+    Args:
+        client: of the store.
+        experiment_id: where to look.
+
+    Returns:
+        Rows by scene; within it those with a reconstruction first, the best PSNR at the top, then by coverage.
+    """
+    found = client.search_runs([experiment_id], "metrics.`eval/coverage` >= 0", max_results=_MOST_RUNS)
+    # A reconstruction carries the figures of its rollout, which would otherwise count twice.
+    rollouts = {run.data.tags.get(ROLLOUT_RUN_TAG) for run in found}
+    groups: dict[tuple[str, str, str], list[dict[str, float]]] = defaultdict(list)
+    for run in found:
+        metrics = {name: value for name, value in run.data.metrics.items() if math.isfinite(value)}
+        tags = run.data.tags
+        # A run without a policy is that of a training with evaluations in between.
+        told = tags.get(POLICY_TAG) and {"eval/coverage", "eval/views"} <= metrics.keys()
+        if told and tags.get(KIND_TAG) != COMPARISON and run.info.run_id not in rollouts:
+            method = tags.get(METHOD_TAG) or tags.get(KIND_TAG) or EVALUATION
+            groups[tags[POLICY_TAG], tags.get(SCENE_TAG, "?"), method].append(metrics)
+    return sorted((_method(*key, group) for key, group in groups.items()), key=_rank)
 
 
-def main(argv: Sequence[str]) -> None:
-    """Collect, compare, print, keep."""
-    from mlflow.exceptions import MlflowException
+def _method(policy: str, scene: str, method: str, runs: Sequence[Mapping[str, float]]) -> Method:
+    means, halves = {}, {}
+    for name in (figure.name for figure in _SHOWN):
+        values = [run[f"eval/{name}"] for run in runs if f"eval/{name}" in run]
+        if values:
+            mean, half = mean_and_half_width(values)
+            means[name] = float(mean)
+            # A single evaluation is itself a mean over episodes, and knows its interval.
+            halves[name] = float(half) if len(values) > 1 else runs[0].get(f"eval/{name}_ci95", math.nan)
+    coverages, views = ([run[name] for run in runs] for name in ("eval/coverage", "eval/views"))
+    means["cpv"] = coverage_per_view(coverages, views)  # type: ignore[arg-type]
+    return Method(policy, scene, method, len(runs), means, {**halves, "cpv": math.nan})
 
-    options = _options(argv)
-    client = connect(options.address)
-    try:
-        experiment = _experiment(client, options.experiment)
-        methods = _methods(client, experiment, options)
-        table = markdown(methods)
-        print(table)
-        run = keep(client, experiment.experiment_id, methods)
-        prepare_experiment(client, experiment.experiment_id)
-    except MlflowException as error:
-        raise TrackingError(f"MLflow at {shown(options.address)} does not answer: {first_line(error)}") from None
-    if options.out is not None:
-        _publish(options.out, methods)
-        print(f"files:   {options.out}")
-    print(f"MLflow:  run {run} in experiment {experiment.name!r} at {shown(options.address)}")
-    print(f"look:    {_look(options.address, experiment.experiment_id, run)}")
+
+def _rank(method: Method) -> tuple[Any, ...]:
+    psnr = method.means.get("psnr", -math.inf)
+    return method.scene, -psnr, -method.means["coverage"], method.policy, method.method
+
+
+def markdown(methods: Sequence[Method]) -> str:
+    """The table."""
+    return table(COLUMNS, [method.cells() for method in methods]) + "\n"
+
+
+def picture(methods: Sequence[Method], path: Path) -> bool:
+    """Draw PSNR against views, one point per method; False where none has a reconstruction."""
+    from matplotlib.figure import Figure
+
+    drawn = [method for method in methods if "psnr" in method.means]
+    if not drawn:
+        return False
+    drawing = Figure(figsize=(6.4, 4), layout="constrained")
+    axes = drawing.subplots()
+    for method in drawn:
+        # What tells a row from the others.
+        parts = [name for name in ("scene", "method") if len({getattr(other, name) for other in drawn}) > 1]
+        told = ", ".join(getattr(method, name) for name in parts)
+        axes.errorbar(
+            *(method.means["views"], method.means["psnr"]),
+            *(method.halves["psnr"], method.halves["views"]),
+            **{"fmt": "o", "capsize": 3, "color": run_colour(method.policy)},
+            label=f"{method.policy} ({told})" if told else method.policy,
+        )
+    axes.set(xlabel="views (fewer is better)", ylabel="PSNR [dB] on held-out views", title="up and left is better")
+    axes.margins(0.12)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+    drawing.savefig(path, dpi=120)
+    return True
 
 
 def keep(client: "MlflowClient", experiment_id: str, methods: Sequence[Method]) -> str:
@@ -109,42 +174,79 @@ def keep(client: "MlflowClient", experiment_id: str, methods: Sequence[Method]) 
     Returns:
         The run's id.
     """
-    scenes = ", ".join(sorted({method.scene for method in methods}))[:_MAX_TAG]
-    run_id = _kept(client, experiment_id, scenes)
-    made = run_id is None
-    if run_id is None:
-        tags = {KIND_TAG: KIND, SCENE_TAG: scenes}
-        run_id = client.create_run(experiment_id, run_name=NAME, tags=tags).info.run_id
+    tags = {KIND_TAG: COMPARISON, SCENE_TAG: ", ".join(sorted({method.scene for method in methods}))[:MAX_TAG]}
+    of_kind = client.search_runs([experiment_id], f"tags.`{KIND_TAG}` = '{COMPARISON}'")
+    kept = [run for run in of_kind if run.data.tags.get(SCENE_TAG) == tags[SCENE_TAG]]
+    run = kept[0] if kept else client.create_run(experiment_id, run_name=COMPARISON, tags=tags)
+    run_id = run.info.run_id
     try:
-        _log(client, run_id, methods, made=made)
+        client.log_dict(run_id, {"columns": COLUMNS, "data": [method.cells() for method in methods]}, TABLE)
+        # As `log_table` does, which would append to a table that is there.
+        client.set_tag(run_id, "mlflow.loggedArtifacts", json.dumps([{"path": TABLE, "type": "table"}]))
+        with tempfile.TemporaryDirectory() as folder:
+            _write(Path(folder), methods)
+            for path in Path(folder).iterdir():
+                client.log_artifact(run_id, os.fspath(path))
+        # The page shows it above everything else.
+        client.set_tag(run_id, NOTE_TAG, (markdown(methods) + _HOW_TO_READ)[:MAX_TAG])
     finally:
         client.set_terminated(run_id)
     return run_id
 
 
-def _log(client: "MlflowClient", run_id: str, methods: Sequence[Method], *, made: bool) -> None:
-    by_column = columns(methods)
-    if made:
-        client.log_table(run_id, by_column, TABLE)
-    else:
-        # `log_table` would append to the table that is there.
-        rows = list(map(list, zip(*by_column.values(), strict=True)))
-        client.log_dict(run_id, {"columns": list(by_column), "data": rows}, TABLE)
-    with tempfile.TemporaryDirectory() as name:
-        for path in _write(Path(name), methods):
-            client.log_artifact(run_id, os.fspath(path))
-    # The page shows it above everything else.
-    client.set_tag(run_id, _NOTE, (markdown(methods) + _HOW_TO_READ)[:_MAX_TAG])
+def _write(folder: Path, methods: Sequence[Method]) -> None:
+    (folder / MARKDOWN).write_text(markdown(methods) + _HOW_TO_READ, encoding="utf-8")
+    picture(methods, folder / PICTURE)
 
 
-def _kept(client: "MlflowClient", experiment_id: str, scenes: str) -> str | None:
-    query = f"tags.`{KIND_TAG}` = '{KIND}'"
-    found = client.search_runs([experiment_id], query)
-    return next((run.info.run_id for run in found if run.data.tags.get(SCENE_TAG) == scenes), None)
+@dataclass(frozen=True)
+class Compare:
+    """Compare the policies of an MLflow experiment by their reconstructions and evaluations, and print the table.
+
+    It is kept in the experiment as the run 'comparison', which is made once and then renewed.
+    """
+
+    experiment: Annotated[str | None, arg(help=f"Of MLflow (omitted: {DEFAULT_HELP}).")] = None
+    mlflow: Annotated[str, arg(help=ADDRESS_HELP)] = "auto"
+    scene: UseAppendAction[tuple[str, ...]] = ()
+    """Only this scene; give it again for more."""
+    out: Path | None = None
+    """Write table and picture to this folder, too; must not exist."""
+
+    def __post_init__(self) -> None:
+        """Refuse no place."""
+        if self.mlflow == "off":
+            raise UsageError("mlflow: expected an address or auto, got off: it is MLflow's runs that are compared")
+
+
+def main(options: Compare) -> None:
+    """Collect, compare, print, keep."""
+    from mlflow.exceptions import MlflowException
+
+    address = str(address_of(options.mlflow, default=DEFAULT_ADDRESS))
+    folder = None if options.out is None else NewFolder(options.out, failure=UsageError)
+    client = connect(address)
+    try:
+        experiment = _experiment(client, options.experiment)
+        methods = _methods(client, experiment, options)
+        print(markdown(methods))
+        run = keep(client, experiment.experiment_id, methods)
+        prepare_experiment(client, experiment.experiment_id)
+    except MlflowException as error:
+        raise TrackingError(f"MLflow at {shown(address)} does not answer: {first_line(error)}") from None
+    if folder is not None:
+        with folder:
+            _write(folder.path("."), methods)
+            print(f"files:   {folder.publish()}")
+    page = f"#/experiments/{experiment.experiment_id}/runs/{run}?{MODEL_TRAINING}"
+    served = urlsplit(address).scheme in ("http", "https")
+    there = f"{how_to_look(address).rstrip('/')}/" if served else f"{how_to_look(address)}, then http://127.0.0.1:5000/"
+    print(f"MLflow:  run {run} in experiment {experiment.name!r} at {shown(address)}")
+    print(f"look:    {there}{page}")
 
 
 def _experiment(client: "MlflowClient", option: str | None) -> "Experiment":
-    name, identity = meant(option)
+    name, identity = chosen_experiment(option)
     found = find_experiment(client, name, identity)
     if found is None:
         known = [experiment.name for experiment in client.search_experiments()]
@@ -152,45 +254,19 @@ def _experiment(client: "MlflowClient", option: str | None) -> "Experiment":
     return found
 
 
-def _methods(client: "MlflowClient", experiment: "Experiment", options: argparse.Namespace) -> list[Method]:
-    runs = collect_runs(client, experiment.experiment_id)
-    if not runs:
+def _methods(client: "MlflowClient", experiment: "Experiment", options: Compare) -> list[Method]:
+    methods = compare(client, experiment.experiment_id)
+    if not methods:
         raise AVPError(
-            f"experiment {experiment.name!r} at {shown(options.address)} has no run with eval/coverage, eval/views "
+            f"experiment {experiment.name!r} at {shown(client.tracking_uri)} has no run with eval/coverage, eval/views "
             "and the tag avp.policy; such runs are made by python -m avp_sb3.evaluate, ns-train avp-nerfacto and "
             "python -m avp_nerfstudio.log"
         )
-    known = {run.scene for run in runs}
+    known = {method.scene for method in methods}
     for scene in options.scene:
         if scene not in known:
             raise UsageError(f"--scene: {unknown_name('scene', scene, known)}")
-    return compare(run for run in runs if not options.scene or run.scene in options.scene)
-
-
-def _write(folder: Path, methods: Sequence[Method]) -> list[Path]:
-    path = folder / MARKDOWN
-    path.write_text(markdown(methods) + _HOW_TO_READ, encoding="utf-8")
-    return [path, *([folder / PICTURE] if picture(methods, folder / PICTURE) else [])]
-
-
-def _publish(folder: Path, methods: Sequence[Method]) -> None:
-    """Write the folder; it appears only when it is whole."""
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as name:
-            partial = Path(name) / "whole"
-            partial.mkdir()
-            _write(partial, methods)
-            partial.rename(folder)
-    except OSError as error:
-        raise UsageError(f"--out {folder}: cannot write there: {error.strerror or error}") from None
-
-
-def _look(address: str, experiment_id: str, run_id: str) -> str:
-    page = f"#/experiments/{experiment_id}/runs/{run_id}?{MODEL_TRAINING}"
-    if urlsplit(address).scheme in ("http", "https"):
-        return f"{shown(address).rstrip('/')}/{page}"
-    return f"mlflow ui --backend-store-uri {shlex.quote(shown(address))}, then http://127.0.0.1:5000/{page}"
+    return [method for method in methods if not options.scene or method.scene in options.scene]
 
 
 if __name__ == "__main__":

@@ -1,76 +1,144 @@
 """`python -m avp_habitat.tracking.deliver`: send MLflow what it could not be sent while a program ran."""
 
-import argparse
+import logging
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from tqdm import tqdm
+from tyro.conf import arg
 
 from avp_habitat import command
 from avp_habitat.errors import UsageError
-from avp_habitat.tracking.journal import SPOOL_VARIABLE, Journal, spool_folder
-from avp_habitat.tracking.opening import Recovered, finish, left_journals
+from avp_habitat.tracking.journal import SPOOL_VARIABLE, Journal, headers, spool_folder
+from avp_habitat.tracking.run import TrackedRun
 from avp_habitat.tracking.stores import TrackingError, absolute, shown
 
-# Somebody waits for this, and a server that has just been started takes long over its first answers.
+# Somebody waits for the command, and a server that has just been started takes long over its first answers.
 _PATIENCE_S = 120.0
+_log = logging.getLogger(__name__)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m avp_habitat.tracking.deliver",
-        description="Send MLflow the points and files of runs that it could not be sent while they lasted; close runs "
-        "whose program was killed. Each point arrives once, however often this is run.",
+@dataclass(frozen=True)
+class Recovered:
+    """What became of one journal."""
+
+    run_id: str
+    """MLflow's, or the one given offline."""
+    address: str
+    """Of its store."""
+    status: str
+    """The run's."""
+    delivered: bool
+    """Whether MLflow has everything; the journal is gone then."""
+    killed: bool
+    """Whether the run was left open by a process that was killed, and is now closed."""
+
+
+def left_journals(spool: Path) -> Iterator[Journal]:
+    """The journals that no living process holds; each is to be closed before the next is taken."""
+    for folder in headers(spool):
+        if (journal := Journal.adopt(folder)) is not None:
+            yield journal
+
+
+def finish(journal: Journal, *, again: bool = False, timeout_s: float = 30.0) -> Recovered:
+    """Send what a journal holds and close its run, as KILLED when its process did not.
+
+    Args:
+        journal: nobody's.
+        again: try also what MLflow refused.
+        timeout_s: to wait for a store at most without any progress.
+    """
+    header = journal.header
+    killed, last_ms = header["ended"] is None, journal.last_written_ms()
+    if again:
+        journal.restore_rejected()
+    run = TrackedRun(journal, None, uncertain=True, interval_s=0.0)
+    ended = run.close("KILLED", at_ms=last_ms, timeout_s=timeout_s) if killed else run.leave(timeout_s=timeout_s)
+    return Recovered(run.run_id, run.address, header["ended"], ended, killed and header["owned"])
+
+
+def recover(spool: Path, *, timeout_s: float = 30.0, on_each: Callable[[Recovered], object] = lambda _: None) -> None:
+    """Finish all journals that killed processes left in a folder."""
+    for journal in left_journals(spool):
+        ended, made = journal.header["ended"] is not None, journal.header["run_id"] is not None
+        if journal.pending or (made and not ended):
+            on_each(finish(journal, timeout_s=timeout_s))
+        elif journal.has_rejected:
+            journal.release()  # It waits for somebody who looks at it.
+        else:
+            journal.remove()
+
+
+def recover_in_background(spool: Path) -> threading.Thread:
+    """`recover` without making anybody wait for a slow server; a warning names each run."""
+
+    def work() -> None:
+        with suppress(OSError):
+            recover(spool, timeout_s=10.0, on_each=_warn)
+
+    thread = threading.Thread(target=work, name="avp-mlflow-recovery", daemon=True)
+    thread.start()
+    return thread
+
+
+def _warn(result: Recovered) -> None:
+    done = "closed as KILLED" if result.killed else "completed"
+    state = done if result.delivered else "still not sent"
+    _log.warning("MLflow run %s of an earlier program, at %s: %s", result.run_id, shown(result.address), state)
+
+
+@dataclass(frozen=True)
+class Deliver:
+    """Send MLflow the points and files of runs that it could not be sent while they lasted.
+
+    Runs whose program was killed are closed. Each point arrives once, however often this is run.
+    """
+
+    spool: Annotated[Path | None, arg(help=f"Where they wait (omitted: {SPOOL_VARIABLE}, else runs/mlflow-spool).")] = (
+        None
     )
-    add = parser.add_argument
-    add(
-        "--spool", type=Path, metavar="DIR", help=f"where they wait (default: {SPOOL_VARIABLE}, else runs/mlflow-spool)"
-    )
-    add("--mlflow", metavar="ADDRESS", help="send them there instead of where they were meant for")
-    add("--again", action="store_true", help="try also what MLflow refused")
-    add("--list", action="store_true", help="only say what waits")
-    return parser
+    mlflow: str | None = None
+    """Send them to this address instead of where they were meant for."""
+    again: bool = False
+    """Try also what MLflow refused."""
+    list: bool = False
+    """Only say what waits."""
 
 
-def main(argv: Sequence[str]) -> None:
+def main(options: Deliver) -> None:
     """Deliver; an error when something stays."""
-    options = _parser().parse_args(argv)
     spool = (options.spool or spool_folder()).absolute()
     if options.spool is not None and not spool.is_dir():
         raise UsageError(f"--spool {options.spool}: no such folder")
-    journals = {folder: header for folder in sorted(spool.glob("*")) if (header := Journal.peek(folder)) is not None}
-    if not journals:
+    waiting = headers(spool)
+    if not waiting:
         print(f"{spool}: nothing waits")
-        return
-    if options.list:
-        for folder, header in journals.items():
+    elif options.list:
+        for folder, header in waiting.items():
             print(f"{folder.name}  run {header['run_id'] or '(none yet)'}  for {shown(header['address'])}")
-        return
-    done = _deliver(spool, len(journals), address=options.mlflow, again=options.again)
-    for result in done:
-        print(_line(result))
-    if busy := len(journals) - len(done):
-        print(f"{busy} of {len(journals)} belong to programs that still run")
-    if failed := sum(not result.delivered for result in done):
-        raise TrackingError(f"{failed} of {len(journals)} runs could not be sent; they stay in {spool}")
+    else:
+        _deliver(spool, len(waiting), options)
 
 
-def _deliver(spool: Path, count: int, *, address: str | None, again: bool) -> list[Recovered]:
+def _deliver(spool: Path, count: int, options: Deliver) -> None:
     done = []
-    with tqdm(total=count, unit="run", desc="sending", disable=None) as progress:
-        for journal in left_journals(spool):
-            if address is not None:
-                journal.header["address"] = absolute(address)
-            done.append(finish(journal, again=again, timeout_s=_PATIENCE_S))
-            progress.update()
-    return done
-
-
-def _line(result: Recovered) -> str:
-    what = "sent" if result.delivered else "NOT sent"
-    killed = ", its program was killed" if result.killed else ""
-    return f"run {result.run_id} at {shown(result.address)}: {what} ({result.status}{killed})"
+    for journal in command.progress(left_journals(spool), total=count, unit="run", desc="sending"):
+        if options.mlflow is not None:
+            journal.header["address"] = absolute(options.mlflow)
+        done.append(finish(journal, again=options.again, timeout_s=_PATIENCE_S))
+    for result in done:
+        killed = ", its program was killed" if result.killed else ""
+        sent = "sent" if result.delivered else "NOT sent"
+        print(f"run {result.run_id} at {shown(result.address)}: {sent} ({result.status}{killed})")
+    if busy := count - len(done):
+        print(f"{busy} of {count} belong to programs that still run")
+    if failed := sum(not result.delivered for result in done):
+        raise TrackingError(f"{failed} of {count} runs could not be sent; they stay in {spool}")
 
 
 if __name__ == "__main__":

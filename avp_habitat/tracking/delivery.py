@@ -1,25 +1,42 @@
-"""Entries of a journal told to MLflow so that each arrives once, however often it is told.
+"""The thread that tells MLflow what a journal holds, each entry once, and keeps trying while MLflow does not answer.
 
 MLflow's databases take a point that they have already for the same point; its folder stores and the servers in front of
 them do not. After a call of which nobody knows whether it worked, points that the run has are therefore left out.
 """
 
 import json
+import logging
 import math
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from avp_habitat.tracking.stores import TrackingError, first_line
+from avp_habitat.tracking.experiments import create_run
+from avp_habitat.tracking.journal import Journal
+from avp_habitat.tracking.names import CHANGED_TAG, MAX_TAG
+from avp_habitat.tracking.stores import (
+    StoreUnreachableError,
+    TrackingError,
+    connect,
+    first_line,
+    is_missing,
+    shown,
+    unreachable,
+)
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-    from mlflow.entities import Metric
 
-CHANGED_TAG = "avp.changed_params"
-_MAX_TAG = 5000
-_METRICS_PER_CALL, _PARAMS_PER_CALL, _TAGS_PER_CALL = 900, 100, 100
+INTERVAL_S = 5.0
+"""Time between two calls while a run lasts; each costs the training tens of milliseconds of Python."""
+_RETRY_S = (1.0, 15.0)
+_ASKED_AGAIN, _FAILED_AGAIN = 2, 8
+_PER_CALL = {"metrics": 900, "params": 100, "tags": 100}
 _PERMANENT = {
     "BAD_REQUEST",
     "ENDPOINT_NOT_FOUND",
@@ -31,123 +48,192 @@ _PERMANENT = {
     "RESOURCE_ALREADY_EXISTS",
     "RESOURCE_DOES_NOT_EXIST",
 }
+_THREAD = "avp-mlflow"
+_log = logging.getLogger(__name__)
 
-Reject = Callable[[dict[str, Any], str], None]
-"""Takes an entry that MLflow refuses, and why."""
 
+class Sender:
+    """Sends one journal's entries until it is stopped."""
 
-class Delivery:
-    """The way from a run's journal to its MLflow run."""
-
-    def __init__(self, client: "MlflowClient", run_id: str, folder: Path | None, reject: Reject) -> None:
-        """Tell `client` about the run; `folder` is the journal's, for the files that entries name."""
-        self._client = client
-        self._run_id = run_id
-        self._folder = folder
-        self._reject = reject
-        self.calls = 0
-        """How many calls MLflow has answered."""
-
-    def send(self, entries: Sequence[dict[str, Any]], *, uncertain: bool) -> None:
-        """Tell MLflow.
+    def __init__(
+        self, journal: Journal, client: "MlflowClient | None", *, uncertain: bool, interval_s: float = INTERVAL_S
+    ) -> None:
+        """Begin.
 
         Args:
-            entries: of the journal, the oldest first.
-            uncertain: whether some of them may have arrived already.
-
-        Raises:
-            Exception: MLflow cannot be reached, or fails for another reason that may pass.
+            journal: to empty; its run is made when it does not exist yet.
+            client: of its store; None connects when something is to be sent.
+            uncertain: whether the first entries may have been sent by an earlier process.
+            interval_s: between two calls.
         """
-        self._send_values([entry for entry in entries if _is_values(entry)], uncertain=uncertain)
-        # Of files that replace each other the last one is enough. A run ends after everything else.
-        files = {entry["path"]: entry for entry in entries if "file" in entry}
-        others = [entry for entry in entries if not _is_values(entry) and "file" not in entry]
-        for entry in [*files.values(), *others]:
-            self._unless_refused([entry], lambda entry=entry: self._send_one(entry))
+        self._journal = journal
+        self._client: Any = client
+        self._run_id: str | None = None
+        self._uncertain = uncertain
+        self._interval_s = interval_s
+        self._hurry = threading.Event()
+        self._stopped = threading.Event()
+        self._answers = self._unanswered = self._failures = 0
+        self._told: set[str] = set()
+        self.problem: str | None = None
+        """Why nothing arrives just now."""
+        # MLflow writes a hundred lines about each failure of a database; here one line says it once.
+        logging.getLogger("mlflow.store.db.utils").addFilter(_is_not_ours)
+        # A daemon, so that an interpreter that exits without `stop` is not held up; the journal keeps the rest.
+        self._thread = threading.Thread(target=self._work, name=_THREAD, daemon=True)
+        self._thread.start()
 
-    def _send_values(self, entries: list[dict[str, Any]], *, uncertain: bool) -> None:
-        from mlflow.entities import Metric, Param, RunTag
+    def warn_once(self, key: str, text: str) -> None:
+        """Log a warning that is the first one of its key."""
+        if key not in self._told:
+            self._told.add(key)
+            _log.warning(text)
 
-        points = [Metric(*point) for entry in entries for point in entry.get("metrics", ())]
-        if uncertain:
-            points = self._missing(points)
-        for chunk in _chunks(points, _METRICS_PER_CALL):
-            self._unless_refused(
-                [{"metrics": [[p.key, p.value, p.timestamp, p.step] for p in chunk]}],
-                lambda chunk=chunk: self._client.log_batch(self._run_id, metrics=chunk),
+    def drain(self, timeout_s: float) -> bool:
+        """Send everything without waiting for the interval; whether MLflow has it.
+
+        Args:
+            timeout_s: to wait at most without any progress; a server that is gone is asked twice more instead.
+        """
+        unanswered, failures = self._unanswered + _ASKED_AGAIN, self._failures + _FAILED_AGAIN
+        answers, until = self._answers, time.monotonic() + timeout_s
+        self._hurry.set()
+        try:
+            while not self._journal.wait(0.2, pending=False):
+                if self._answers > answers:
+                    answers, until = self._answers, time.monotonic() + timeout_s
+                gone = self._unanswered >= unanswered or self._failures >= failures
+                if gone or time.monotonic() > until or not self._thread.is_alive():
+                    return False
+            return True
+        finally:
+            self._hurry.clear()
+
+    def stop(self, timeout_s: float = 5.0) -> bool:
+        """End the thread; whether it ended, which a call that hangs may prevent."""
+        self._stopped.set()
+        self._hurry.set()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _work(self) -> None:
+        pause = _RETRY_S[0]
+        while not self._stopped.is_set():
+            if not self._journal.wait(0.2, pending=True):
+                continue
+            try:
+                self._send_some()
+            except Exception as error:
+                self._failed(error)
+                # Somebody who starts to wait for us ends the pause, and makes it short.
+                if self._hurry.is_set():
+                    self._stopped.wait(min(pause, 0.5))
+                else:
+                    self._hurry.wait(pause)
+                pause = min(2 * pause, _RETRY_S[1])
+                continue
+            if self.problem is not None:
+                _log.warning("MLflow at %s takes the run's points again", shown(self._journal.header["address"]))
+            self.problem, pause = None, _RETRY_S[0]
+            self._hurry.wait(self._interval_s)
+
+    def _failed(self, error: Exception) -> None:
+        self._uncertain = True
+        self._failures += 1
+        self._unanswered += isinstance(error, StoreUnreachableError)
+        if self.problem is None:
+            kept = "" if self._journal.folder is None else f" in {self._journal.folder}"
+            _log.warning(
+                "MLflow at %s does not take the run's points now (%s); they are kept%s and sent when it does",
+                *(shown(self._journal.header["address"]), first_line(error), kept),
             )
-        tags: dict[str, str] = {}
-        for entry in entries:
-            tags |= entry.get("tags", {})
-        params = [Param(*pair) for pair in self._new_params(entries, tags).items()]
-        for chunk in _chunks(params, _PARAMS_PER_CALL):
-            self._unless_refused(
-                [{"params": {param.key: param.value for param in chunk}}],
-                lambda chunk=chunk: self._client.log_batch(self._run_id, params=chunk),
-            )
-        for chunk in _chunks([RunTag(*pair) for pair in tags.items()], _TAGS_PER_CALL):
-            self._unless_refused(
-                [{"tags": {tag.key: tag.value for tag in chunk}}],
-                lambda chunk=chunk: self._client.log_batch(self._run_id, tags=chunk),
-            )
+        self.problem = first_line(error)
 
-    def _new_params(self, entries: list[dict[str, Any]], tags: dict[str, str]) -> dict[str, str]:
-        """Parameters that the run does not have; a changed one, which MLflow would refuse, is added to the tags."""
-        wanted: dict[str, str] = {}
-        for entry in entries:
-            wanted |= entry.get("params", {})
-        if not wanted:
-            return {}
-        known = self._client.get_run(self._run_id).data.params
-        changed = {name: [known[name], value] for name, value in wanted.items() if known.get(name, value) != value}
-        if changed:
-            tags[CHANGED_TAG] = json.dumps(changed)[:_MAX_TAG]
-        return {name: value for name, value in wanted.items() if name not in known}
-
-    def _send_one(self, entry: dict[str, Any]) -> None:
-        if "file" in entry:
-            self._send_file(Path(entry["file"]), entry["path"])
-        elif "end" in entry:
-            self._client.set_terminated(self._run_id, entry["end"], entry["at"])
-        else:
-            raise TrackingError("nobody can read this line")
-
-    def _send_file(self, file: Path, path: str) -> None:
-        """An artifact; the file lies in the journal's folder, in a folder of its own, and then goes."""
-        source = self._inside(file)
-        if not source.is_file():
-            return  # It was sent, and the process killed before it could say so.
-        folder = PurePosixPath(path).parent.as_posix()
-        self._client.log_artifact(self._run_id, str(source), None if folder == "." else folder)
-
-    def _inside(self, file: Path) -> Path:
-        if self._folder is None:
-            return file
-        source = (self._folder / file).resolve()
-        if not source.is_relative_to(self._folder.resolve()):
-            raise TrackingError(f"{file}: expected a file within {self._folder}")
-        return source
-
-    def forget_files(self, entries: Iterable[dict[str, Any]]) -> None:
-        """Remove the files of entries that are acknowledged."""
+    def _send_some(self) -> None:
+        if (problem := unreachable(self._journal.header["address"])) is not None:
+            raise StoreUnreachableError(problem)
+        if self._run_id is None:
+            self._run_id = self._open_run()
+        entries = self._journal.read()
+        self._send(entries)
+        self._journal.acknowledge()
+        self._uncertain = False
         for entry in entries:
             if "file" in entry:
-                shutil.rmtree(self._inside(Path(entry["file"])).parent, ignore_errors=True)
+                shutil.rmtree(self._file_of(entry).parent, ignore_errors=True)
 
-    def _missing(self, points: "list[Metric]") -> "list[Metric]":
+    def _open_run(self) -> str:
+        """Connect; make the run, or open it again, as the journal's header asks."""
+        header = self._journal.header
+        if self._client is None:
+            if header["run_id"] is not None and is_missing(header["address"]):
+                raise StoreUnreachableError("the database is gone")
+            self._client = connect(header["address"])
+        if header["run_id"] is None:
+            self._journal.update({"run_id": create_run(self._client, header)})
+        elif header.get("continue"):
+            self._client.update_run(header["run_id"], status="RUNNING")
+        return str(header["run_id"])
+
+    def _send(self, entries: Sequence[dict[str, Any]]) -> None:
+        """Tell MLflow; any error is one that may pass."""
+        self._send_values(entries)
+        # Of files that replace each other the last one is enough. A run ends after everything else.
+        files = {entry["path"]: entry for entry in entries if "file" in entry}
+        others = [entry for entry in entries if not entry.keys() & {*_PER_CALL, "file"}]
+        for entry in [*files.values(), *others]:
+            self._call(entry, partial(self._send_file if "file" in entry else self._end, entry))
+
+    def _send_values(self, entries: Sequence[Mapping[str, Any]]) -> None:
+        from mlflow.entities import Metric, Param, RunTag
+
+        points = [point for entry in entries for point in entry.get("metrics", ())]
+        params: dict[str, str] = {}
+        tags: dict[str, str] = {}
+        for entry in entries:
+            params |= entry.get("params", {})
+            tags |= entry.get("tags", {})
+        if params:
+            # A parameter that has another value already, which MLflow would refuse, is told as a tag.
+            known = self._client.get_run(self._run_id).data.params
+            changed = {name: [known[name], value] for name, value in params.items() if known.get(name, value) != value}
+            tags |= {CHANGED_TAG: json.dumps(changed)[:MAX_TAG]} if changed else {}
+            params = {name: value for name, value in params.items() if name not in known}
+        metrics = self._missing(points) if self._uncertain else points
+        kinds: dict[str, tuple[type, list[Any]]] = {
+            "metrics": (Metric, metrics),
+            "params": (Param, list(params.items())),
+            "tags": (RunTag, list(tags.items())),
+        }
+        for kind, (entity, items) in kinds.items():
+            for start in range(0, len(items), _PER_CALL[kind]):
+                chunk = items[start : start + _PER_CALL[kind]]
+                entry = {kind: chunk if kind == "metrics" else dict(chunk)}
+                batch = {kind: [entity(*item) for item in chunk]}
+                self._call(entry, partial(self._client.log_batch, self._run_id, **batch))
+
+    def _missing(self, points: Sequence[Sequence[Any]]) -> list[Sequence[Any]]:
         """Those of the points that the run does not have."""
         known: set[tuple[Any, ...]] = set()
-        for key in {point.key for point in points}:
-            known |= {_identity(point) for point in self._client.get_metric_history(self._run_id, key)}
-            self.calls += 1
-        missing = []
-        for point in points:
-            if _identity(point) not in known:
-                known.add(_identity(point))
-                missing.append(point)
-        return missing
+        for key in {key for key, *_ in points}:
+            history = self._client.get_metric_history(self._run_id, key)
+            known |= {_identity(point.key, point.value, point.timestamp, point.step) for point in history}
+            self._answers += 1
+        return list({_identity(*point): point for point in points if _identity(*point) not in known}.values())
 
-    def _unless_refused(self, entries: list[dict[str, Any]], call: Callable[[], object]) -> None:
+    def _send_file(self, entry: Mapping[str, Any]) -> None:
+        """An artifact; no file is there when it was sent and the process killed before it could say so."""
+        folder = PurePosixPath(entry["path"]).parent.as_posix()
+        if (source := self._file_of(entry)).is_file():
+            self._client.log_artifact(self._run_id, str(source), None if folder == "." else folder)
+
+    def _end(self, entry: Mapping[str, Any]) -> None:
+        if "end" not in entry:
+            raise TrackingError("nobody can read this line")
+        self._client.set_terminated(self._run_id, entry["end"], entry["at"])
+
+    def _call(self, entry: Mapping[str, Any], call: Callable[[], object]) -> None:
+        """Call MLflow; an entry that it refuses for good is kept as rejected."""
         from mlflow.exceptions import MlflowException
 
         try:
@@ -155,22 +241,20 @@ class Delivery:
         except (MlflowException, TrackingError) as error:
             if isinstance(error, MlflowException) and error.error_code not in _PERMANENT:
                 raise
-            for entry in entries:
-                self._reject(entry, first_line(error))
-        self.calls += 1
+            reason = first_line(error)
+            self._journal.reject(entry, reason)
+            self.warn_once(reason, f"MLflow run {self._run_id} refuses some metrics or files: {reason}")
+        self._answers += 1
+
+    def _file_of(self, entry: Mapping[str, Any]) -> Path:
+        return Path(self._journal.folder or "") / entry["file"]
 
 
-def _is_values(entry: dict[str, Any]) -> bool:
-    return bool(entry.keys() & {"metrics", "tags", "params"})
+def _is_not_ours(record: logging.LogRecord) -> bool:
+    return record.threadName != _THREAD
 
 
-def _chunks(items: list[Any], size: int) -> Iterable[list[Any]]:
-    return (items[start : start + size] for start in range(0, len(items), size))
-
-
-def _identity(point: "Metric") -> tuple[Any, ...]:
+def _identity(key: str, value: float, timestamp: int, step: int) -> tuple[Any, ...]:
     """What makes a point the same point; MLflow's databases keep infinity as the largest number."""
-    value = point.value
-    if math.isnan(value):
-        return point.key, point.timestamp, point.step, None
-    return point.key, point.timestamp, point.step, max(min(value, 1.7976931348623157e308), -1.7976931348623157e308)
+    largest = sys.float_info.max
+    return key, timestamp, step, None if math.isnan(value) else max(min(value, largest), -largest)

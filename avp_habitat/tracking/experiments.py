@@ -1,25 +1,25 @@
-"""MLflow's experiments: which one is meant, and its id."""
+"""Experiments of a store and the runs in them: found, made once, opened again."""
 
 import os
-import time
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
+from avp_habitat.tracking.names import KEY_TAG, OFFLINE, PARENT_TAG
 from avp_habitat.tracking.stores import TrackingError, shown
+from avp_habitat.tracking.view import prepare_experiment
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-    from mlflow.entities import Experiment
+    from mlflow.entities import Experiment, Run
 
 DEFAULT_EXPERIMENT = "avp"
 NAME_VARIABLE, ID_VARIABLE = "MLFLOW_EXPERIMENT_NAME", "MLFLOW_EXPERIMENT_ID"
 DEFAULT_HELP = f"{NAME_VARIABLE} or {ID_VARIABLE}, else {DEFAULT_EXPERIMENT}"
-# MLflow's `Default`; `mlflow run` sets this id where nobody chose an experiment.
-_NOBODYS_CHOICE = "0"
-_ATTEMPTS = 5
+_NOT_THERE = ("RESOURCE_DOES_NOT_EXIST", "INVALID_PARAMETER_VALUE")
 
 
-def meant(option: str | None) -> tuple[str | None, str | None]:
-    """The name or the id of the experiment that is meant; one of them is None.
+def chosen_experiment(option: str | None) -> tuple[str | None, str | None]:
+    """The name or the id of the experiment that runs go to; one of them is None.
 
     Args:
         option: a name; when omitted, what MLflow's variables say, which `mlflow.set_experiment` sets too, else `avp`.
@@ -27,7 +27,8 @@ def meant(option: str | None) -> tuple[str | None, str | None]:
     if option:
         return option, None
     identity = os.environ.get(ID_VARIABLE)
-    if identity and identity != _NOBODYS_CHOICE:
+    # `mlflow run` sets the id of MLflow's `Default`, 0, where nobody chose an experiment.
+    if identity and identity != "0":
         return None, identity
     return os.environ.get(NAME_VARIABLE) or DEFAULT_EXPERIMENT, None
 
@@ -39,30 +40,26 @@ def find_experiment(client: "MlflowClient", name: str | None, identity: str | No
         TrackingError: it is deleted, or there is none of that id.
         MlflowException: the store does not answer.
     """
-    found = client.get_experiment_by_name(name) if name is not None else _of_id(client, str(identity))
+    from mlflow.exceptions import MlflowException
+
+    store = shown(client.tracking_uri)
+    try:
+        found = client.get_experiment_by_name(name) if name is not None else client.get_experiment(str(identity))
+    except MlflowException as error:
+        if name is not None or error.error_code not in _NOT_THERE:
+            raise
+        raise TrackingError(f"{ID_VARIABLE}={identity}: MLflow at {store} has no such experiment") from None
     if found is not None and found.lifecycle_stage != "active":
-        restore = f"mlflow experiments restore --experiment-id {found.experiment_id}"
+        restore = f"MLFLOW_TRACKING_URI={store} mlflow experiments restore --experiment-id {found.experiment_id}"
         raise TrackingError(
-            f"MLflow experiment {found.name!r} at {shown(client.tracking_uri)} is deleted; bring it back with: "
-            f"MLFLOW_TRACKING_URI={shown(client.tracking_uri)} {restore}, or choose another one (option experiment, "
-            f"or {NAME_VARIABLE})"
+            f"MLflow experiment {found.name!r} at {store} is deleted; bring it back with: {restore}, or choose "
+            f"another one (option experiment, or {NAME_VARIABLE})"
         )
     return found
 
 
-def _of_id(client: "MlflowClient", identity: str) -> "Experiment":
-    from mlflow.exceptions import MlflowException
-
-    try:
-        return client.get_experiment(identity)
-    except MlflowException as error:
-        if error.error_code not in ("RESOURCE_DOES_NOT_EXIST", "INVALID_PARAMETER_VALUE"):
-            raise
-    raise TrackingError(f"{ID_VARIABLE}={identity}: MLflow at {shown(client.tracking_uri)} has no such experiment")
-
-
-def experiment_id(client: "MlflowClient", name: str | None, identity: str | None = None) -> tuple[str, bool]:
-    """The id of an experiment, which is made, with its views, when it does not exist; whether it was made now.
+def experiment_id(client: "MlflowClient", name: str | None, identity: str | None = None) -> str:
+    """The id of an experiment, which is made, with its views, when it does not exist.
 
     Args:
         client: of the store.
@@ -75,20 +72,70 @@ def experiment_id(client: "MlflowClient", name: str | None, identity: str | None
     """
     from mlflow.exceptions import MlflowException
 
-    from avp_habitat.tracking.view import prepare_experiment
+    found = find_experiment(client, name, identity)
+    if found is not None:
+        return found.experiment_id
+    try:
+        made = client.create_experiment(str(name))
+    except MlflowException:
+        # Another process may have been faster.
+        if (found := find_experiment(client, name)) is None:
+            raise
+        return found.experiment_id
+    prepare_experiment(client, made)
+    return made
 
-    for attempt in range(_ATTEMPTS):
-        found = find_experiment(client, name, identity)
-        if found is not None:
-            return found.experiment_id, False
-        try:
-            made = client.create_experiment(str(name))
-        except MlflowException:
-            # Another process may have been faster.
-            if attempt == _ATTEMPTS - 1:
-                raise
-            time.sleep(0.1)
-        else:
-            prepare_experiment(client, made)
-            return made, True
-    raise AssertionError
+
+def find_run(client: "MlflowClient", run_id: str | None) -> "Run | None":
+    """The run of an id, also of one that was given offline; None when the store has none that is not deleted."""
+    from mlflow.exceptions import MlflowException
+
+    if not run_id:
+        return None
+    if run_id.startswith(OFFLINE):
+        return next(iter(search_tags(client, {KEY_TAG: run_id.removeprefix(OFFLINE)})), None)
+    try:
+        run = client.get_run(run_id)
+    except MlflowException as error:
+        if error.error_code in _NOT_THERE:
+            return None
+        raise
+    return run if run.info.lifecycle_stage == "active" else None
+
+
+def existing_run(client: "MlflowClient", run_id: str) -> "Run":
+    """The run of an id.
+
+    Raises:
+        TrackingError: there is none.
+    """
+    run = find_run(client, run_id)
+    if run is None:
+        raise TrackingError(f"MLflow run {run_id}: expected a run at {shown(client.tracking_uri)}, found none")
+    return run
+
+
+def search_tags(client: "MlflowClient", tags: Mapping[str, str], home: str | None = None) -> "list[Run]":
+    """The runs that have these tags, of the experiment of the id `home`, else of all."""
+    homes = [home] if home else [experiment.experiment_id for experiment in client.search_experiments()]
+    return list(client.search_runs(homes, " AND ".join(f"tags.`{name}` = '{tags[name]}'" for name in tags)))
+
+
+def create_run(client: "MlflowClient", header: Mapping[str, Any]) -> str:
+    """The id of a journal's run, which is made when the store has none for its key.
+
+    Args:
+        client: of the store.
+        header: of the journal: `key`, `experiment`, `experiment_id`, `name`, `tags`, `parent` and `started_ms`.
+    """
+    earlier = find_run(client, f"{OFFLINE}{header['key']}") if header.get("creating") else None
+    if earlier is not None:
+        return earlier.info.run_id
+    identity = experiment_id(client, header["experiment"], header.get("experiment_id"))
+    tags = {**header["tags"], KEY_TAG: header["key"]}
+    parent = find_run(client, header.get("parent"))
+    # MLflow nests runs within one experiment only.
+    if parent is not None and parent.info.experiment_id == identity:
+        tags[PARENT_TAG] = parent.info.run_id
+    run = client.create_run(identity, start_time=header["started_ms"], tags=tags, run_name=header["name"])
+    return run.info.run_id

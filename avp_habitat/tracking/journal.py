@@ -15,68 +15,51 @@ import threading
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from avp_habitat.tracking.names import OFFLINE
 
-@contextmanager
-def alone(name: str) -> Iterator[None]:
-    """Wait until no other program of this user is within a block of the same name."""
-    with (Path(tempfile.gettempdir()) / f"avp-{os.getuid()}-{name}.lock").open("w") as file:
-        with suppress(OSError):  # A file system without locks.
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-
-
-Entry = Mapping[str, Any]
-
-DEFAULT_SPOOL = Path("runs") / "mlflow-spool"
 SPOOL_VARIABLE = "AVP_MLFLOW_SPOOL"
 VERSION = 1
-_HEADER, _ENTRIES, _SENT, _LOCK, _REJECTED, _FILES = (
-    "run.json",
-    "journal.jsonl",
-    "sent",
-    "lock",
-    "rejected.jsonl",
-    "files",
-)
+_HEADER, _ENTRIES, _SENT, _LOCK, _REJECTED = "run.json", "journal.jsonl", "sent", "lock", "rejected.jsonl"
 _KEYS = {"key", "address", "run_id", "owned", "ended", "started_ms"}
-_CHUNK = 1 << 20
-_COMPACT = 4 << 20
+_CHUNK, _COMPACT = 1 << 20, 4 << 20
 # A POSIX lock goes when its process closes any descriptor of the file, so nobody here may open one of our own again.
 _ours: set[Path] = set()
 
 
 def spool_folder() -> Path:
     """Where journals lie: `AVP_MLFLOW_SPOOL`, else `runs/mlflow-spool` in the current folder."""
-    return Path(os.environ.get(SPOOL_VARIABLE) or DEFAULT_SPOOL).absolute()
+    return Path(os.environ.get(SPOOL_VARIABLE) or "runs/mlflow-spool").absolute()
 
 
-@dataclass(frozen=True)
-class Batch:
-    """Entries that MLflow does not have yet."""
+def headers(spool: Path) -> dict[Path, dict[str, Any]]:
+    """The headers of all journals of a folder, in use or left by their processes."""
+    return {path: header for path in sorted(spool.glob("*")) if (header := Journal.peek(path)) is not None}
 
-    entries: list[dict[str, Any]]
-    """The oldest first."""
-    end: int | None
-    """Where they end in the file, bytes; None for entries that wait in memory."""
+
+def journal_of(spool: Path, run_id: str) -> Path | None:
+    """The folder of the journal of a run, in use or left; None when there is none."""
+    found = headers(spool).items()
+    return next((path for path, one in found if run_id in (one["run_id"], f"{OFFLINE}{one['key']}")), None)
 
 
 class Journal:
     """The journal of one run; one thread may append while another one reads."""
 
-    def __init__(self, folder: Path | None, header: dict[str, Any]) -> None:
+    def __init__(self, folder: Path | None, header: Mapping[str, Any]) -> None:
         """Use `create` or `adopt`."""
         self.folder = folder
-        self.header = header
+        self.header = dict(header)
         self._lock = threading.Condition()
         self._waiting: deque[dict[str, Any]] = deque()
-        self._held: list[int] = []
+        self._descriptors: list[int] = []
         self._file = self._mark = -1
         self._size = self._sent = 0
+        self._read_to = 0
+        self._read_waiting = 0
         self._temporary: tempfile.TemporaryDirectory[str] | None = None
         self.problem: str | None = None
         """Why the disk takes nothing; None while it does."""
@@ -84,15 +67,14 @@ class Journal:
     @classmethod
     def create(cls, spool: Path, header: Mapping[str, Any]) -> "Journal":
         """A new journal; in memory, with `problem` set, when the disk takes none."""
-        key = str(header["key"])
-        folder = spool / key
-        journal = cls(folder, dict(header))
+        folder = spool / str(header["key"])
+        journal = cls(folder, header)
         try:
             folder.mkdir(parents=True, mode=0o700)
             journal._open()
-            journal.save_header()
+            journal._write_header()
         except OSError as error:
-            journal._close_files()
+            journal.release()
             shutil.rmtree(folder, ignore_errors=True)
             journal.folder, journal.problem = None, f"{folder}: {error.strerror or error}"
         return journal
@@ -114,44 +96,26 @@ class Journal:
         if folder in _ours or cls.peek(folder) is None:
             return None
         journal = cls(folder, {})
-        try:
+        with suppress(OSError):
             journal._open()
-        except OSError:
-            return None
-        # Its process may have finished it, and removed it, until we had the lock.
-        header = cls.peek(folder)
-        if header is None:
-            journal.release()
-            return None
-        journal.header = header
-        return journal
+            # Its process may have finished it, and removed it, until we had the lock.
+            if (header := cls.peek(folder)) is not None:
+                journal.header = header
+                return journal
+        journal.release()
+        return None
 
-    @classmethod
-    def in_use(cls, folder: Path) -> bool:
-        """Whether a living process holds a journal."""
-        journal = cls.adopt(folder)
-        if journal is not None:
-            journal.release()
-        return journal is None
+    def update(self, changes: Mapping[str, Any]) -> None:
+        """Change the header; a disk that does not take it has the earlier one, with which nothing is lost either."""
+        with self._lock, suppress(OSError):
+            self.header |= changes
+            self._write_header()
 
     def last_written_ms(self) -> int:
         """When the last entry was written, milliseconds since 1970."""
         return int(os.fstat(self._file).st_mtime * 1000)
 
-    def save_header(self) -> None:
-        """Write `header` down.
-
-        Raises:
-            OSError: the disk does not take it.
-        """
-        if self.folder is None:
-            return
-        path = self.folder / _HEADER
-        temporary = path.with_suffix(".new")
-        temporary.write_text(json.dumps(self.header, indent=1) + "\n", encoding="utf-8")
-        temporary.rename(path)
-
-    def append(self, entry: Entry) -> None:
+    def append(self, entry: Mapping[str, Any]) -> None:
         """Add an entry; one that the disk does not take waits in memory, before all later ones."""
         with self._lock:
             self._waiting.append(dict(entry))
@@ -160,44 +124,48 @@ class Journal:
                 self._write_waiting()
             self._lock.notify_all()
 
-    def read(self) -> Batch | None:
-        """The oldest entries that were not acknowledged; None when there are none."""
+    def read(self) -> list[dict[str, Any]]:
+        """The oldest entries that were not acknowledged; empty when there are none."""
         with self._lock:
             self._write_waiting()
-            if self._sent < self._size:
-                data = os.pread(self._file, min(_CHUNK, self._size - self._sent), self._sent)
-                # A line longer than a chunk is read whole.
-                while b"\n" not in data:
-                    data += os.pread(self._file, _CHUNK, self._sent + len(data))
-                data = data[: data.rindex(b"\n") + 1]
-                return Batch([_parsed(line) for line in data.splitlines()], self._sent + len(data))
-            return Batch(list(self._waiting), None) if self._waiting else None
+            if self._sent == self._size:
+                self._read_to, self._read_waiting = self._sent, len(self._waiting)
+                return list(self._waiting)
+            data = os.pread(self._file, min(_CHUNK, self._size - self._sent), self._sent)
+            # A line longer than a chunk is read whole.
+            while b"\n" not in data:
+                data += os.pread(self._file, _CHUNK, self._sent + len(data))
+            data = data[: data.rindex(b"\n") + 1]
+            self._read_to, self._read_waiting = self._sent + len(data), 0
+            return [_parsed(line) for line in data.splitlines()]
 
-    def acknowledge(self, batch: Batch) -> None:
-        """Note that MLflow has these."""
+    def acknowledge(self) -> None:
+        """Note that MLflow has what `read` gave last."""
         with self._lock:
-            if batch.end is None:
-                for _ in batch.entries:
-                    self._waiting.popleft()
-            else:
-                self._sent = batch.end
-                if self._sent == self._size and self._size > _COMPACT:
-                    os.ftruncate(self._file, 0)
-                    self._sent = self._size = 0
-                self._mark_sent()
+            for _ in range(self._read_waiting):
+                self._waiting.popleft()
+            self._sent, self._read_waiting = self._read_to, 0
+            if self._sent == self._size > _COMPACT:
+                os.ftruncate(self._file, 0)
+                self._sent = self._read_to = self._size = 0
+            self._mark_sent()
             self._lock.notify_all()
 
-    def wait(self, timeout_s: float, *, for_entries: bool) -> bool:
+    @property
+    def pending(self) -> bool:
+        """Whether something was not acknowledged."""
+        return self._sent < self._size or bool(self._waiting)
+
+    def wait(self, timeout_s: float, *, pending: bool) -> bool:
         """Wait until there are entries, or until there are none; whether that came true in time."""
         with self._lock:
-            return self._lock.wait_for(lambda: bool(self) == for_entries, timeout_s)
+            return self._lock.wait_for(lambda: self.pending == pending, timeout_s)
 
-    def reject(self, entry: Entry, reason: str) -> None:
+    def reject(self, entry: Mapping[str, Any], reason: str) -> None:
         """Keep an entry that MLflow refuses, with its reason, beside the others."""
-        if self.folder is None:
-            return
-        with suppress(OSError), (self.folder / _REJECTED).open("a", encoding="utf-8") as file:
-            file.write(json.dumps({**entry, "reason": reason}) + "\n")
+        if self.folder is not None:
+            with suppress(OSError), (self.folder / _REJECTED).open("a", encoding="utf-8") as file:
+                file.write(json.dumps({**entry, "reason": reason}) + "\n")
 
     def restore_rejected(self) -> None:
         """Put refused entries back, to be tried again."""
@@ -222,7 +190,7 @@ class Journal:
         """
         if self.folder is None and self._temporary is None:
             self._temporary = tempfile.TemporaryDirectory(prefix="avp-mlflow-")
-        home = (self.folder or Path(self._temporary.name)) / _FILES / uuid4().hex  # type: ignore[union-attr]
+        home = Path(self.folder or self._temporary.name) / "files" / uuid4().hex  # type: ignore[union-attr]
         home.mkdir(parents=True)
         try:
             yield home / name
@@ -244,39 +212,40 @@ class Journal:
 
     def release(self) -> None:
         """Leave the journal to the next process."""
-        self._close_files()
+        while self._descriptors:
+            os.close(self._descriptors.pop())
+        if self.folder is not None:
+            _ours.discard(self.folder)
         if self._temporary is not None:
             self._temporary.cleanup()
             self._temporary = None
 
-    def __bool__(self) -> bool:
-        """Whether something was not acknowledged."""
-        return self._sent < self._size or bool(self._waiting)
-
     def _open(self) -> None:
         assert self.folder is not None
-        lock = os.open(self.folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            os.close(lock)
-            raise
+        fcntl.lockf(self._descriptor(_LOCK), fcntl.LOCK_EX | fcntl.LOCK_NB)
         _ours.add(self.folder)
-        self._held.append(lock)
-        self._file = os.open(self.folder / _ENTRIES, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        self._mark = os.open(self.folder / _SENT, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        self._held += [self._file, self._mark]
+        self._file, self._mark = self._descriptor(_ENTRIES), self._descriptor(_SENT)
         self._size = _whole_lines(self._file)
         sent = os.pread(self._mark, 32, 0).strip()
         self._sent = int(sent) if sent.isdigit() and int(sent) <= self._size else 0
         self._mark_sent()
 
+    def _descriptor(self, name: str) -> int:
+        assert self.folder is not None
+        self._descriptors.append(os.open(self.folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+        return self._descriptors[-1]
+
+    def _write_header(self) -> None:
+        if self.folder is not None:
+            new = self.folder / "run.new"
+            new.write_text(json.dumps(self.header, indent=1) + "\n", encoding="utf-8")
+            new.rename(self.folder / _HEADER)
+
     def _write_waiting(self) -> None:
         while self._waiting and self.folder is not None:
             line = json.dumps(self._waiting[0], separators=(",", ":")).encode() + b"\n"
             try:
-                written = os.pwrite(self._file, line, self._size)
-                if written < len(line):
+                if os.pwrite(self._file, line, self._size) < len(line):
                     raise OSError(None, "the disk is full")
             except OSError as error:
                 with suppress(OSError):
@@ -292,26 +261,12 @@ class Journal:
         with suppress(OSError):
             os.pwrite(self._mark, f"{self._sent:020d}\n".encode(), 0)
 
-    def _close_files(self) -> None:
-        for descriptor in reversed(self._held):
-            os.close(descriptor)
-        self._held.clear()
-        self._file = self._mark = -1
-        if self.folder is not None:
-            _ours.discard(self.folder)
-
 
 def _whole_lines(file: int) -> int:
     """The file's size after an incomplete last line, which only losing the machine leaves, is cut off."""
-    size = os.fstat(file).st_size
-    end = size
-    while end > 0:
-        start = max(0, end - _CHUNK)
-        found = os.pread(file, end - start, start).rfind(b"\n")
-        if found >= 0:
-            end = start + found + 1
-            break
-        end = start
+    size = end = os.fstat(file).st_size
+    while end > 0 and os.pread(file, 1, end - 1) != b"\n":
+        end -= 1
     if end != size:
         os.ftruncate(file, end)
     return end

@@ -1,26 +1,30 @@
-"""Runs as the store knows them: found, made once, opened again."""
+"""Names of the tags that runs and experiments have, and names and lengths that MLflow takes."""
 
-import os
 import re
-from typing import TYPE_CHECKING
 
-from avp_habitat.tracking.stores import StoreUnreachableError, connect
+KIND_TAG = "avp.kind"
+"""training, rollout, reconstruction, evaluation, comparison, experiment."""
+POLICY_TAG, SCENE_TAG, METHOD_TAG = "avp.policy", "avp.scene", "avp.method"
+DIGEST_TAG, SIMULATOR_TAG = "avp.scene_digest", "avp.simulator"
+ROLLOUT_TAG, ROLLOUT_ID_TAG = "avp.rollout", "avp.rollout_id"
+POLICY_RUN_TAG, ROLLOUT_RUN_TAG = "avp.policy_run", "avp.rollout_run"
+"""The run that trained the policy, and that of the rollout which a reconstruction is made from."""
+CONTINUED_TAG, RESUMED_TAG = "avp.continued_from", "avp.resumed_at_step"
+KEY_TAG, RENAMED_TAG, CHANGED_TAG = "avp.key", "avp.renamed", "avp.changed_params"
+VIEWS_TAG = "avp.views"
+"""Of an experiment whose page has been prepared."""
+PARENT_TAG, NOTE_TAG, COLOUR_TAG = "mlflow.parentRunId", "mlflow.note.content", "mlflow.runColor"
+COMMIT_TAG, IMAGES_TAG = "mlflow.source.git.commit", "mlflow.loggedImages"
+VIEW_TAG, PAGE_TAG = "mlflow.sharedViewState.", "mlflow.experimentKind"
 
-if TYPE_CHECKING:
-    from mlflow import MlflowClient
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+ROLLOUT, RECONSTRUCTION, COMPARISON, EVALUATION = "rollout", "reconstruction", "comparison", "evaluation"
+"""Values of `avp.kind`."""
+OFFLINE = "offline-"
+"""How the ids of runs begin that MLflow does not know yet; the key of their journal follows."""
 
-from avp_habitat.tracking.experiments import experiment_id
-from avp_habitat.tracking.stores import TrackingError, shown
-
-if TYPE_CHECKING:
-    from mlflow import MlflowClient
-    from mlflow.entities import Run
-
-
+MAX_NAME, MAX_PARAM, MAX_TAG = 250, 6000, 5000
+"""Characters that MLflow takes."""
 _BRACKETS, _UNSAFE = re.compile(r"[()\[\]{}]"), re.compile(r"[^\w.\- /]")
-_MAX_NAME = 250
 
 
 def safe_name(name: str) -> str:
@@ -30,125 +34,23 @@ def safe_name(name: str) -> str:
     parts, which MLflow would resolve like a file path, go.
     """
     parts = (part.strip() for part in _UNSAFE.sub("_", _BRACKETS.sub("", name)).split("/"))
-    return "/".join(part for part in parts if part not in ("", ".", ".."))[:_MAX_NAME].rstrip("/ ") or "_"
+    return "/".join(part for part in parts if part not in ("", ".", ".."))[:MAX_NAME].rstrip("/ ") or "_"
 
 
-class Names:
-    """The safe names of one run: each name has its own, also when two differ only in what MLflow refuses."""
+class SafeNames(dict[str, str]):
+    """The safe names of one run by name: each has its own, also where two differ only in what MLflow refuses."""
 
-    def __init__(self) -> None:
-        """Begin without any."""
-        self._safe: dict[str, str] = {}
-        self._taken: set[str] = set()
-
-    def __getitem__(self, name: str) -> str:
-        """The safe name."""
-        if name not in self._safe:
-            self._safe[name] = self._free(safe_name(name))
-            self._taken.add(self._safe[name])
-        return self._safe[name]
+    def __missing__(self, name: str) -> str:
+        """Choose one, with a number where it is taken."""
+        safe = candidate = safe_name(name)
+        count = 1
+        while candidate in self.values():
+            count += 1
+            candidate = f"{safe[: MAX_NAME - 4]} {count}"
+        self[name] = candidate
+        return candidate
 
     @property
     def changed(self) -> dict[str, str]:
-        """Safe names by the names that MLflow refuses."""
-        return {name: safe for name, safe in self._safe.items() if name != safe}
-
-    def _free(self, name: str) -> str:
-        candidate, count = name, 1
-        while candidate in self._taken:
-            count += 1
-            candidate = f"{name[: _MAX_NAME - 4]} {count}"
-        return candidate
-
-
-OFFLINE_VARIABLE = "AVP_MLFLOW_OFFLINE"
-
-
-def wants_offline(offline: bool | None) -> bool:
-    """Whether to go on without the server: as said, else as the variable `AVP_MLFLOW_OFFLINE` says."""
-    return os.environ.get(OFFLINE_VARIABLE, "") not in ("", "0") if offline is None else offline
-
-
-def open_store(address: str, *, offline: bool | None = None, option: str | None = None) -> "MlflowClient | None":
-    """A client of the store; None when it does not answer and we are told to go on without it.
-
-    Args:
-        address: of the store.
-        offline: whether to go on without it; None as `AVP_MLFLOW_OFFLINE` says.
-        option: how the caller's users say so, for the error's text, beside that variable.
-
-    Raises:
-        TrackingError: the store cannot be used.
-    """
-    try:
-        return connect(address)
-    except StoreUnreachableError as error:
-        if wants_offline(offline):
-            return None
-        ways = ", or ".join(way for way in (option, f"{OFFLINE_VARIABLE}=1") if way)
-        raise StoreUnreachableError(f"{error}; to go on without it and send everything later: {ways}") from None
-
-
-OFFLINE = "offline-"
-"""How the ids of runs begin that MLflow does not know yet; the key of their journal follows."""
-KEY_TAG, PARENT_TAG = "avp.key", "mlflow.parentRunId"
-
-
-def find_run(client: "MlflowClient", run_id: str | None) -> "Run | None":
-    """The run of an id, also of one that was given offline; None when the store has none that is not deleted."""
-    from mlflow.exceptions import MlflowException
-
-    if not run_id:
-        return None
-    if run_id.startswith(OFFLINE):
-        return _of_key(client, run_id.removeprefix(OFFLINE))
-    try:
-        run = client.get_run(run_id)
-    except MlflowException as error:
-        if error.error_code in ("RESOURCE_DOES_NOT_EXIST", "INVALID_PARAMETER_VALUE"):
-            return None
-        raise
-    return run if run.info.lifecycle_stage == "active" else None
-
-
-def existing_run(client: "MlflowClient", run_id: str) -> "Run":
-    """The run of an id.
-
-    Raises:
-        TrackingError: there is none.
-    """
-    run = find_run(client, run_id)
-    if run is None:
-        raise TrackingError(f"MLflow run {run_id}: expected a run at {shown(client.tracking_uri)}, found none")
-    return run
-
-
-def create(client: "MlflowClient", header: Mapping[str, Any]) -> str:
-    """The id of a journal's run, which is made when the store has none for its key.
-
-    Args:
-        client: of the store.
-        header: of the journal: `key`, `experiment`, `experiment_id`, `name`, `tags`, `parent` and `started_ms`.
-    """
-    earlier = _of_key(client, header["key"]) if header.get("creating") else None
-    if earlier is not None:
-        return earlier.info.run_id
-    identity, _ = experiment_id(client, header["experiment"], header.get("experiment_id"))
-    tags = {**header["tags"], KEY_TAG: header["key"]}
-    parent = find_run(client, header.get("parent"))
-    # MLflow nests runs within one experiment only.
-    if parent is not None and parent.info.experiment_id == identity:
-        tags[PARENT_TAG] = parent.info.run_id
-    run = client.create_run(identity, start_time=header["started_ms"], tags=tags, run_name=header["name"])
-    return run.info.run_id
-
-
-def reopen(client: "MlflowClient", run_id: str) -> None:
-    """Make a run that ended go on."""
-    client.update_run(run_id, status="RUNNING")
-
-
-def _of_key(client: "MlflowClient", key: str) -> "Run | None":
-    experiments = [experiment.experiment_id for experiment in client.search_experiments()]
-    found = client.search_runs(experiments, f"tags.`{KEY_TAG}` = '{key}'", max_results=1)
-    return found[0] if found else None
+        """Those that MLflow refuses."""
+        return {name: safe for name, safe in self.items() if name != safe}

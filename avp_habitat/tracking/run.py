@@ -6,16 +6,17 @@ import math
 import shutil
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal
 from uuid import uuid4
 
-from avp_habitat.tracking.delivery import Delivery
-from avp_habitat.tracking.journal import Journal
-from avp_habitat.tracking.names import Names, create, reopen, safe_name
-from avp_habitat.tracking.sender import INTERVAL_S, Sender
-from avp_habitat.tracking.stores import StoreUnreachableError, connect, is_missing, shown
+from avp_habitat.errors import AVPError
+from avp_habitat.tracking.delivery import INTERVAL_S, Sender
+from avp_habitat.tracking.experiments import chosen_experiment, create_run, existing_run, find_run
+from avp_habitat.tracking.journal import VERSION, Journal, journal_of, spool_folder
+from avp_habitat.tracking.names import IMAGES_TAG, MAX_PARAM, MAX_TAG, OFFLINE, RENAMED_TAG, SafeNames, safe_name
+from avp_habitat.tracking.stores import DELIVER, TrackingError, absolute, connect, first_line, open_store, shown
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,16 +25,14 @@ if TYPE_CHECKING:
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 
-_MAX_PARAM, _MAX_TAG = 6000, 5000
 _CLOSING_S = 30.0
-_NAMES_TAG = "avp.renamed"
 _log = logging.getLogger(__name__)
 
 
 class TrackedRun:
     """A run; everything it is told is on disk at once and with MLflow soon, in the background.
 
-    Made by `avp_habitat.tracking.opening`. All methods may be called from any thread, one at a time.
+    Made by `start_run`, `continue_run` and `join_run`. All methods may be called from any thread, one at a time.
     """
 
     def __init__(
@@ -53,18 +52,16 @@ class TrackedRun:
             interval_s: between two calls of MLflow.
         """
         self._journal = journal
-        self._client = client
-        self._names = Names()
-        self._told: set[str] = set()
-        self._sender = Sender(journal, self.address, self._open_delivery, uncertain=uncertain, interval_s=interval_s)
-        self._sender.start()
+        self._names = SafeNames()
+        self._sender = Sender(journal, client, uncertain=uncertain, interval_s=interval_s)
         if journal.problem is not None:
-            self._tell_once("disk", f"MLflow's points cannot be kept on disk ({journal.problem}), only in memory")
+            text = f"MLflow's points cannot be kept on disk ({journal.problem}), only in memory"
+            self._sender.warn_once("disk", text)
 
     @property
     def run_id(self) -> str:
         """MLflow's id; `offline-KEY` as long as MLflow does not know the run."""
-        return self._journal.header["run_id"] or f"offline-{self._journal.header['key']}"
+        return self._journal.header["run_id"] or f"{OFFLINE}{self._journal.header['key']}"
 
     @property
     def address(self) -> str:
@@ -79,27 +76,26 @@ class TrackedRun:
     def metrics(self, values: Mapping[str, float], step: int, *, timestamp_ms: int | None = None) -> None:
         """Add numbers at a step; names that MLflow refuses are changed, which the tag `avp.renamed` says."""
         at = int(time.time() * 1000) if timestamp_ms is None else timestamp_ms
-        known = len(self._names.changed)
+        known = len(self._names)
         points = [[self._names[name], float(value), at, int(step)] for name, value in values.items()]
-        if len(self._names.changed) > known:
-            changed = self._names.changed
-            _log.info("MLflow does not take all names; changed: %s", changed)
-            self.tags({_NAMES_TAG: json.dumps(changed)})
+        if len(self._names) > known and (changed := self._names.changed):
+            self.tags({RENAMED_TAG: json.dumps(changed)})
         for name, value, _, _ in points:
             if not math.isfinite(value):
-                self._tell_once(f"value {name}", f"MLflow run {self.run_id}: {name} is {value} at step {step}")
+                text = f"MLflow run {self.run_id}: {name} is {value} at step {step}"
+                self._sender.warn_once(f"value {name}", text)
         if points:
             self._append({"metrics": points})
 
     def tags(self, values: Mapping[str, str]) -> None:
         """Set tags; long texts are cut."""
         if values:
-            self._append({"tags": {safe_name(name): str(value)[:_MAX_TAG] for name, value in values.items()}})
+            self._append({"tags": {safe_name(name): str(value)[:MAX_TAG] for name, value in values.items()}})
 
     def params(self, values: Mapping[str, Any]) -> None:
         """Set parameters; one that the run has already keeps its value, which the tag `avp.changed_params` says."""
         if values:
-            self._append({"params": {safe_name(name): str(value)[:_MAX_PARAM] for name, value in values.items()}})
+            self._append({"params": {safe_name(name): str(value)[:MAX_PARAM] for name, value in values.items()}})
 
     def save(self, path: str, write: Callable[[Path], object]) -> bool:
         """Keep an artifact that `write` writes to a file; whether that worked, which a full disk prevents.
@@ -112,7 +108,7 @@ class TrackedRun:
             with self._journal.new_file(PurePosixPath(path).name) as file:
                 write(file)
         except OSError as error:
-            self._tell_once(f"file {path}", f"MLflow run {self.run_id}: {path} cannot be kept: {error}")
+            self._sender.warn_once(f"file {path}", f"MLflow run {self.run_id}: {path} cannot be kept: {error}")
             return False
         folder = self._journal.folder
         self._append({"file": str(file.relative_to(folder) if folder else file), "path": path})
@@ -134,7 +130,7 @@ class TrackedRun:
         stem = f"images/{series}+step+{step}+timestamp+{int(time.time() * 1000)}+{uuid4()}"
         self.save(f"{stem}.png", lambda file: picture.save(file, compress_level=1))
         self.save(f"{stem}+compressed.webp", lambda file: small.save(file, quality=80))
-        self.tags({"mlflow.loggedImages": "True"})
+        self.tags({IMAGES_TAG: "True"})
 
     def flush(self, timeout_s: float = _CLOSING_S) -> bool:
         """Wait until MLflow has everything; whether it has."""
@@ -148,12 +144,9 @@ class TrackedRun:
             at_ms: when it ended, milliseconds since 1970; now when omitted.
             timeout_s: to wait for a store at most without any progress.
         """
-        header = self._journal.header
-        header["ended"] = status
         try:
-            with suppress(OSError):
-                self._journal.save_header()
-            if header["owned"]:
+            self._journal.update({"ended": status})
+            if self._journal.header["owned"]:
                 self._append({"end": status, "at": at_ms or int(time.time() * 1000)})
         finally:
             delivered = self.leave(timeout_s=timeout_s)
@@ -161,59 +154,169 @@ class TrackedRun:
 
     def leave(self, *, timeout_s: float = _CLOSING_S) -> bool:
         """Send the rest without ending the run; whether MLflow has everything."""
+        journal, idle = self._journal, False
         try:
             self._sender.drain(timeout_s)
         finally:
             # A thread that hangs in a call keeps the journal until this process ends.
-            self._put_away(idle=self._sender.stop())
-        return not self._journal
+            idle = self._sender.stop()
+            if idle and not journal.pending and not journal.has_rejected:
+                journal.remove()
+            else:
+                self._say_what_stays()
+                if idle:
+                    journal.release()
+        return not journal.pending
 
-    def _put_away(self, *, idle: bool) -> None:
+    def _say_what_stays(self) -> None:
         journal = self._journal
-        if idle and not journal and not journal.has_rejected:
-            journal.remove()
-            return
-        if idle:
-            journal.release()
-        where = f"stay in {journal.folder}; send them with: python -m avp_habitat.tracking.deliver"
+        where = f"stay in {journal.folder}; send them with: {DELIVER}"
         if journal.folder is None:
             where = "are lost, because the disk takes nothing either"
-        if journal:
-            reason = self._sender.problem or "it was too slow"
-            _log.warning(
-                "MLflow at %s did not take all of run %s (%s); its last points %s",
-                shown(self.address),
-                self.run_id,
-                reason,
-                where,
-            )
+        if journal.pending:
+            store, reason = shown(self.address), self._sender.problem or "it was too slow"
+            text = "MLflow at %s did not take all of run %s (%s); its last points %s"
+            _log.warning(text, store, self.run_id, reason, where)
         else:
             _log.warning("MLflow refused some of run %s; those points %s --again", self.run_id, where)
-
-    def _open_delivery(self) -> Delivery:
-        header = self._journal.header
-        if self._client is None:
-            if header["run_id"] is not None and is_missing(self.address):
-                raise StoreUnreachableError("the database is gone")
-            self._client = connect(self.address)
-        if header["run_id"] is None:
-            header["run_id"] = create(self._client, header)
-            with suppress(OSError):
-                self._journal.save_header()
-        elif header.get("continue"):
-            reopen(self._client, header["run_id"])
-        return Delivery(self._client, header["run_id"], self._journal.folder, self._refused)
-
-    def _refused(self, entry: dict[str, Any], reason: str) -> None:
-        self._journal.reject(entry, reason)
-        self._tell_once(f"refused {reason}", f"MLflow run {self.run_id} refuses some metrics or files: {reason}")
 
     def _append(self, entry: dict[str, Any]) -> None:
         self._journal.append(entry)
         if self._journal.folder is not None and self._journal.problem is not None:
-            self._tell_once("disk", f"MLflow's points cannot be kept on disk now ({self._journal.problem})")
+            self._sender.warn_once("disk", f"MLflow's points cannot be kept on disk now ({self._journal.problem})")
 
-    def _tell_once(self, key: str, text: str) -> None:
-        if key not in self._told:
-            self._told.add(key)
-            _log.warning(text)
+
+@dataclass(frozen=True)
+class NewRun:
+    """What a run is made from."""
+
+    experiment: str | None = None
+    """Made when it does not exist; as `experiments.chosen_experiment` says when None."""
+    name: str | None = None
+    """Of the run; MLflow invents one when None, the same one after each training that was seeded alike."""
+    tags: Mapping[str, str] = field(default_factory=dict)
+    """Beside those of MLflow's run context."""
+    parent: str | None = None
+    """Id of the run below which MLflow shows this one, when both lie in one experiment."""
+
+
+def start_run(
+    address: str, new: NewRun, *, offline: bool | None = None, spool: Path | None = None, **options: Any
+) -> TrackedRun:
+    """Begin a run.
+
+    Args:
+        address: of the store.
+        new: what the run is made from.
+        offline: True begins although the store does not answer; the run is made when it does. None: as
+            `AVP_MLFLOW_OFFLINE` says.
+        spool: folder of the journals; `spool_folder()` when None.
+        **options: of `TrackedRun`.
+
+    Raises:
+        TrackingError: the store cannot be reached (and `offline` is not set), or refuses.
+    """
+    client = open_store(address, offline=offline, option="offline=True")
+    from mlflow.tracking.context.registry import resolve_tags
+
+    experiment, experiment_id = chosen_experiment(new.experiment)
+    header = _header(address) | {
+        "experiment": experiment,
+        "experiment_id": experiment_id,
+        "name": new.name,
+        "tags": resolve_tags() | dict(new.tags),
+        "parent": new.parent,
+        "creating": True,
+    }
+    journal = Journal.create(spool or spool_folder(), header)
+    if client is not None:
+        try:
+            journal.update({"run_id": create_run(client, header | {"creating": False})})
+        except BaseException as error:
+            journal.remove()
+            if isinstance(error, AVPError) or not isinstance(error, Exception):
+                raise
+            raise TrackingError(f"MLflow at {shown(address)} did not take the run: {first_line(error)}") from error
+    return TrackedRun(journal, client, **options)
+
+
+def continue_run(
+    address: str, run_id: str, *, offline: bool | None = None, spool: Path | None = None, **options: Any
+) -> TrackedRun:
+    """Go on with a run, with what its journal still holds when its process was killed.
+
+    Args:
+        address: of the store.
+        run_id: MLflow's, or the one given offline.
+        offline: as in `start_run`.
+        spool: as in `start_run`.
+        **options: of `TrackedRun`.
+
+    Raises:
+        TrackingError: the store cannot be reached (and `offline` is not set), or has no such run, or the run is being
+            written by another process.
+    """
+    home = spool or spool_folder()
+    client = open_store(address, offline=offline, option="offline=True")
+    folder = journal_of(home, run_id)
+    if folder is not None:
+        journal = Journal.adopt(folder)
+        if journal is None:
+            raise TrackingError(f"MLflow run {run_id}: another program is writing it ({folder})")
+        journal.update({"address": absolute(address), "continue": True, "ended": None})
+    else:
+        if client is not None:
+            run_id = existing_run(client, run_id).info.run_id
+        elif run_id.startswith(OFFLINE):
+            raise TrackingError(f"MLflow run {run_id}: expected its journal in {home}, found none")
+        journal = Journal.create(home, _header(address) | {"run_id": run_id, "continue": True})
+    if client is not None and journal.header["run_id"] is not None:
+        client.update_run(journal.header["run_id"], status="RUNNING")
+        journal.header["continue"] = False
+    return TrackedRun(journal, client, uncertain=folder is not None, **options)
+
+
+def may_continue(address: str, run_id: str, *, spool: Path | None = None) -> bool:
+    """Whether a run was interrupted, so that going on with its model goes on with the run.
+
+    A run that MLflow takes for running, and of which this machine has no journal, may be running elsewhere.
+    """
+    folder = journal_of(spool or spool_folder(), run_id)
+    if folder is not None and (journal := Journal.adopt(folder)) is not None:
+        journal.release()
+        return journal.header["ended"] != "FINISHED"
+    try:
+        run = None if folder is not None else find_run(connect(address), run_id)
+    except TrackingError:
+        return False
+    return run is not None and run.info.status in ("KILLED", "FAILED")
+
+
+def join_run(address: str, run_id: str, *, spool: Path | None = None, **options: Any) -> TrackedRun:
+    """Fill a run that somebody else has opened and will end.
+
+    Args:
+        address: of the store.
+        run_id: of the run.
+        spool: as in `start_run`.
+        **options: of `TrackedRun`.
+
+    Raises:
+        TrackingError: the store cannot be reached or has no such run.
+    """
+    client = connect(address)
+    run_id = existing_run(client, run_id).info.run_id
+    header = _header(address) | {"run_id": run_id, "owned": False}
+    return TrackedRun(Journal.create(spool or spool_folder(), header), client, **options)
+
+
+def _header(address: str) -> dict[str, Any]:
+    return {
+        "version": VERSION,
+        "key": uuid4().hex,
+        "address": absolute(address),
+        "run_id": None,
+        "owned": True,
+        "ended": None,
+        "started_ms": int(time.time() * 1000),
+    }

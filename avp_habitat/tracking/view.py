@@ -6,25 +6,19 @@ import json
 import logging
 import time
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from avp_habitat.metrics import TERMS
+from avp_habitat.metrics import FIGURES, Figure
+from avp_habitat.tracking.names import NOTE_TAG, PAGE_TAG, VIEW_TAG, VIEWS_TAG
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 VERSION = "1"
-VERSION_TAG = "avp.views"
-"""Tag of an experiment that has been prepared; with it, what people change or delete there stays as they left it."""
-VIEW_TAG = "mlflow.sharedViewState."
-NOTE_TAG = "mlflow.note.content"
-KIND_TAG = "mlflow.experimentKind"
-COLOUR_TAG = "mlflow.runColor"
-FIGURES = ("eval/psnr", "eval/views", "eval/coverage", "eval/visibility", "eval/ssim", "eval/lpips")
-"""What answers which policy gives the better reconstruction for fewer views."""
-
+"""Value of the tag `avp.views`; with it, what people change or delete on the page stays as they left it."""
+MODEL_TRAINING = "workflowType=machine_learning"
+"""Parameter of an address: MLflow 3.17 shows pages of traces first to a browser that has never been there."""
 _COLOURS = {
     "heuristic": "#7f7f7f",
     "random": "#bcbd22",
@@ -36,58 +30,56 @@ _COLOURS = {
 }
 _MODEL_COLOURS = ("#d62728", "#ff7f0e", "#2ca02c", "#a55194", "#637939", "#843c39", "#e7969c", "#e7ba52")
 _LOG = logging.getLogger(__name__)
-_TERM_OF = (
-    ("views", "views", "; fewer is better"),
-    ("coverage", "coverage", ", 0 to 1"),
-    ("cpv", "CpV", ", in percent"),
-    ("ei", "EI", ""),
-    ("annd_m", "ANND", ", in metres"),
-    ("redundant_views", "redundant views", ""),
-    ("visibility", "visibility", ", 0 to 1"),
-    ("psnr", "PSNR", ""),
-    ("ssim", "SSIM", ""),
-    ("lpips", "LPIPS", ""),
-)
-"""Metric, its term, and what else there is to say of the number."""
-MODEL_TRAINING = "workflowType=machine_learning"
-"""Parameter of an address: MLflow 3.17 shows pages of traces first to a browser that has never been there."""
+
+Chart = dict[str, Any]
+"""A chart as MLflow's page keeps it, with one colour per run."""
 
 
-@dataclass(frozen=True)
-class Chart:
-    """A chart of the page: a bar per run, unless it says otherwise; one colour per run."""
+def _bar(metric: str) -> Chart:
+    """A bar per run."""
+    return {"type": "BAR", "metricKey": metric}
 
-    metric: str
-    """On its y axis, or the name of its pictures."""
-    by: str | None = None
-    """Metric on its x axis, for a point per run."""
-    line: bool = False
-    """Whether it shows the course of the metric by step."""
-    pictures: bool = False
-    """Whether it shows pictures side by side."""
 
-    def state(self, section: str, number: int) -> dict[str, Any]:
-        """As MLflow's page keeps it."""
-        place = {"uuid": f"{section}-{number}", "metricSectionId": section, "deleted": False, "isGenerated": False}
-        return {**place, "runsCountToCompare": 100, **self._kind()}
+def _scatter(x: str, y: str) -> Chart:
+    """A point per run."""
+    return {"type": "SCATTER", "xaxis": {"key": x, "type": "METRIC"}, "yaxis": {"key": y, "type": "METRIC"}}
 
-    def _kind(self) -> dict[str, Any]:
-        if self.pictures:
-            return {"type": "IMAGE", "imageKeys": [self.metric], "step": 0}
-        if self.by is not None:
-            axes = {"xaxis": {"key": self.by, "type": "METRIC"}, "yaxis": {"key": self.metric, "type": "METRIC"}}
-            return {"type": "SCATTER", **axes}
-        if not self.line:
-            return {"type": "BAR", "metricKey": self.metric}
-        steps = {
-            "xAxisKey": "step",
-            "selectedXAxisMetricKey": "",
-            "useGlobalXaxisKey": False,
-            "xAxisScaleType": "linear",
-        }
-        values = {"yAxisKey": "metric", "yAxisExpressions": [], "scaleType": "linear", "range": {}, "lineSmoothness": 0}
-        keys = {"metricKey": self.metric, "selectedMetricKeys": [self.metric], "useGlobalLineSmoothing": True}
-        return {"type": "LINE", **keys, **steps, **values}
+
+def _line(metric: str) -> Chart:
+    """The course of a metric by step."""
+    x = {"xAxisKey": "step", "selectedXAxisMetricKey": "", "useGlobalXaxisKey": False, "xAxisScaleType": "linear"}
+    y = {"yAxisKey": "metric", "yAxisExpressions": [], "scaleType": "linear", "range": {}, "lineSmoothness": 0}
+    keys = {"metricKey": metric, "selectedMetricKeys": [metric], "useGlobalLineSmoothing": True}
+    return {"type": "LINE", **keys, **x, **y}
+
+
+def _images(name: str) -> Chart:
+    """Pictures side by side."""
+    return {"type": "IMAGE", "imageKeys": [name], "step": 0}
+
+
+_ALWAYS = {
+    "orderByAsc": False,
+    "startTime": "ALL",
+    "lifecycleFilter": "Active",
+    "datasetsFilter": [],
+    "modelVersionFilter": "All Runs",
+    "runsExpanded": {},
+    "runsPinned": [],
+    "runsHidden": [],
+    "runsVisibilityMap": {},
+    "runsHiddenMode": "SHOW_ALL",
+    "viewMaximized": False,
+    "runListHidden": False,
+    "isAccordionReordered": True,
+    "useGroupedValuesInCharts": True,
+    "hideEmptyCharts": True,
+    "groupBy": None,
+    "groupsExpanded": {},
+    "autoRefreshEnabled": True,
+    "globalLineChartConfig": {"xAxisKey": "step", "lineSmoothness": 0, "selectedXAxisMetricKey": ""},
+    "chartsSearchFilter": "",
+}
 
 
 @dataclass(frozen=True)
@@ -100,140 +92,83 @@ class View:
     """In the page's menu of views."""
     runs: str
     """MLflow's search filter of the runs that it shows."""
-    columns: tuple[str, ...]
-    """Of its table, from left to right."""
-    sections: tuple[tuple[str, tuple[Chart, ...]], ...]
-    """Titled groups of charts, from top to bottom."""
-    order: str = "attributes.start_time"
+    columns: str
+    """Of its table, from left to right: metrics as `eval/psnr`, tags as `avp.policy`, parameters as `env.reward`."""
+    order: str
     """Column by which runs are sorted, the largest first."""
-
-    def state(self) -> dict[str, Any]:
-        """As MLflow's page keeps it."""
-        ids = [f"{self.key}-{number}" for number in range(len(self.sections))]
-        places = list(zip(ids, self.sections, strict=True))
-        shown = {"display": True, "isReordered": True, "deleted": False, "isGenerated": False}
-        return {
-            "searchFilter": self.runs,
-            "orderByKey": self.order,
-            "orderByAsc": False,
-            "startTime": "ALL",
-            "lifecycleFilter": "Active",
-            "datasetsFilter": [],
-            "modelVersionFilter": "All Runs",
-            "selectedColumns": list(self.columns),
-            "columnOrder": list(self.columns),
-            "columnWidths": {column: _WIDTHS.get(column, _WIDTH) for column in self.columns},
-            "runsExpanded": {},
-            "runsPinned": [],
-            "runsHidden": [],
-            "runsVisibilityMap": {},
-            "runsHiddenMode": "SHOW_ALL",
-            "viewMaximized": False,
-            "runListHidden": False,
-            "isAccordionReordered": True,
-            "useGroupedValuesInCharts": True,
-            "hideEmptyCharts": True,
-            "groupBy": None,
-            "groupsExpanded": {},
-            "autoRefreshEnabled": True,
-            "globalLineChartConfig": {"xAxisKey": "step", "lineSmoothness": 0, "selectedXAxisMetricKey": ""},
-            "chartsSearchFilter": "",
-            "compareRunSections": [{"uuid": key, "name": name, **shown} for key, (name, _) in places],
-            "compareRunCharts": [
-                chart.state(key, number) for key, (_, charts) in places for number, chart in enumerate(charts)
-            ],
-        }
+    charts: dict[str, list[Chart]]
+    """Groups by title, from top to bottom."""
 
     def tag(self, created_ms: int) -> str:
-        """Value of the experiment's tag that holds it."""
-        state = json.dumps(self.state(), separators=(",", ":")).encode()
-        packed = "deflate;" + base64.b64encode(zlib.compress(state, 9)).decode("ascii")
-        return json.dumps({"name": self.title, "createdAt": created_ms, "state": packed})
+        """Value of the experiment's tag that holds it, as MLflow's page keeps it."""
+        columns = list(map(_column, self.columns.split()))
+        shown = {"display": True, "isReordered": True, "deleted": False, "isGenerated": False}
+        ids = {name: f"{self.key}-{number}" for number, name in enumerate(self.charts)}
+        state = _ALWAYS | {
+            "searchFilter": self.runs,
+            "orderByKey": _column(self.order),
+            "selectedColumns": columns,
+            "columnOrder": columns,
+            # Pixels that hold a column's name.
+            "columnWidths": {_column(name): max(120, 40 + 7 * len(name)) for name in self.columns.split()},
+            "compareRunSections": [{"uuid": ids[name], "name": name, **shown} for name in self.charts],
+            "compareRunCharts": [
+                {
+                    **{"uuid": f"{ids[name]}-{number}", "metricSectionId": ids[name]},
+                    **{"deleted": False, "isGenerated": False, "runsCountToCompare": 100},
+                    **chart,
+                }
+                for name, charts in self.charts.items()
+                for number, chart in enumerate(charts)
+            ],
+        }
+        packed = base64.b64encode(zlib.compress(json.dumps(state, separators=(",", ":")).encode(), 9))
+        return json.dumps({"name": self.title, "createdAt": created_ms, "state": f"deflate;{packed.decode('ascii')}"})
 
 
-def _metric(name: str) -> str:
-    return f"metrics.`{name}`"
+def _column(name: str) -> str:
+    if name == "start_time":
+        return "attributes.start_time"
+    kind = "metrics" if "/" in name else "tags" if name.startswith("avp.") else "params"
+    return f"{kind}.`{name}`"
 
 
-def _tag(name: str) -> str:
-    return f"tags.`{name}`"
-
-
-def _param(name: str) -> str:
-    return f"params.`{name}`"
-
-
-_WIDTH = 110
-_WIDTHS = {
-    _tag("avp.policy"): 150,
-    _tag("avp.scene"): 130,
-    _tag("avp.method"): 120,
-    _metric("eval/coverage"): 125,
-    _metric("eval/coverage_ci95"): 160,
-    _metric("avp/coverage"): 125,
-    _metric("rollout/ep_rew_mean"): 170,
-    _param("env.reward"): 130,
-    _param("env.observation"): 140,
-}
-"""Pixels that hold a column's name."""
+_COMPARED = "eval/psnr eval/views eval/coverage eval/visibility eval/ssim eval/lpips"
+_COURSE = "avp/coverage avp/views avp/cpv rollout/ep_rew_mean avp/stop_share avp/redundant_views"
 RECONSTRUCTIONS = View(
     key="avp-reconstructions",
     title="Reconstructions by policy",
     runs="metrics.`eval/psnr` > -1000",
-    columns=(_tag("avp.policy"), *map(_metric, FIGURES), _tag("avp.scene"), _tag("avp.method")),
-    sections=(
-        ("Up and left is better", (Chart("eval/psnr", by="eval/views"), Chart("eval/psnr", by="eval/coverage"))),
-        ("A bar per run", tuple(map(Chart, FIGURES))),
-    ),
-    order=_metric("eval/psnr"),
+    columns=f"avp.policy {_COMPARED} avp.scene avp.method",
+    order="eval/psnr",
+    charts={
+        "Up and left is better": [_scatter("eval/views", "eval/psnr"), _scatter("eval/coverage", "eval/psnr")],
+        "A bar per run": list(map(_bar, _COMPARED.split())),
+    },
 )
 EVALUATIONS = View(
     key="avp-evaluations",
     title="Evaluations by policy",
     runs="metrics.`eval/curve` >= 0",
-    columns=(
-        _tag("avp.policy"),
-        *map(_metric, ("eval/coverage", "eval/coverage_ci95", "eval/views", "eval/cpv", "eval/stopped")),
-        _metric("eval/episodes"),
-        _tag("avp.scene"),
-    ),
-    sections=(
-        ("Coverage by view", (Chart("eval/curve", line=True), Chart("eval/trajectory", pictures=True))),
-        ("A bar per policy", (Chart("eval/coverage"), Chart("eval/views"), Chart("eval/cpv"))),
-    ),
-    order=_metric("eval/coverage"),
+    columns="avp.policy eval/coverage eval/coverage_ci95 eval/views eval/cpv eval/stopped eval/episodes avp.scene",
+    order="eval/coverage",
+    charts={
+        "Coverage by view": [_line("eval/curve"), _images("eval/trajectory")],
+        "A bar per policy": [_bar("eval/coverage"), _bar("eval/views"), _bar("eval/cpv")],
+    },
 )
 TRAININGS = View(
     key="avp-trainings",
     title="Trainings by environment step",
     runs="metrics.`avp/coverage` >= 0",
-    columns=(
-        _tag("avp.scene"),
-        *map(_metric, ("avp/coverage", "avp/views", "avp/cpv", "rollout/ep_rew_mean", "time/fps")),
-        *map(_param, ("env.reward", "env.observation", "seed")),
-    ),
-    sections=(
-        (
-            "By environment step",
-            tuple(
-                Chart(name, line=True)
-                for name in (
-                    "avp/coverage",
-                    "avp/views",
-                    "avp/cpv",
-                    "rollout/ep_rew_mean",
-                    "avp/stop_share",
-                    "avp/redundant_views",
-                )
-            ),
-        ),
-        (
-            "Evaluations by environment step",
-            tuple(Chart(name, line=True) for name in ("eval/coverage", "eval/views", "eval/cpv")),
-        ),
-    ),
+    columns="avp.scene avp/coverage avp/views avp/cpv rollout/ep_rew_mean time/fps env.reward env.observation seed",
+    order="start_time",
+    charts={
+        "By environment step": list(map(_line, _COURSE.split())),
+        "Evaluations by environment step": [_line("eval/coverage"), _line("eval/views"), _line("eval/cpv")],
+    },
 )
-VIEWS: Sequence[View] = (RECONSTRUCTIONS, EVALUATIONS, TRAININGS)
+VIEWS = (RECONSTRUCTIONS, EVALUATIONS, TRAININGS)
 """In the order of the page's menu."""
 
 
@@ -264,7 +199,7 @@ def prepare_experiment(client: "MlflowClient", experiment_id: str) -> str:
     """
     try:
         present = client.get_experiment(experiment_id).tags
-        if present.get(VERSION_TAG) != VERSION:
+        if present.get(VIEWS_TAG) != VERSION:
             for key, value in _tags(experiment_id, present).items():
                 client.set_experiment_tag(experiment_id, key, value)
     except Exception as error:
@@ -277,25 +212,30 @@ def _tags(experiment_id: str, present: dict[str, str]) -> dict[str, str]:
     now = int(1000 * time.time())
     # The menu shows the latest first.
     views = {VIEW_TAG + view.key: view.tag(now - age) for age, view in enumerate(VIEWS)}
-    once = {NOTE_TAG: _note(experiment_id), KIND_TAG: "custom_model_development"}
-    return views | {key: value for key, value in once.items() if not present.get(key)} | {VERSION_TAG: VERSION}
+    once = {NOTE_TAG: _note(experiment_id), PAGE_TAG: "custom_model_development"}
+    return views | {key: value for key, value in once.items() if not present.get(key)} | {VIEWS_TAG: VERSION}
+
+
+_EXPLAINED = ("views", "coverage", "cpv", "ei", "annd_m", "redundant_views", "visibility", "psnr", "ssim", "lpips")
 
 
 def _note(experiment_id: str) -> str:
     table, charts = (path_of(experiment_id, charts=charts) for charts in (False, True))
+    lines = "\n".join(_explained(FIGURES[name]) for name in _EXPLAINED)
     return f"""\
 Which policy gives the better reconstruction for fewer views? [**Table**]({table}), [**charts**]({charts}).
 
 More views: [evaluations, coverage by view]({path_of(experiment_id, EVALUATIONS, charts=True)}), \
 [trainings by environment step]({path_of(experiment_id, TRAININGS, charts=True)}). All are in the menu *Views*, too.
 
-{_terms()}
+{lines}
 - `avp.policy`, `avp.scene`: who took the pictures, and where.
 
 A table of the means by policy: `python -m avp_habitat.tracking.compare`, then the run *comparison*.
 """
 
 
-def _terms() -> str:
-    """A line for each metric that has a term."""
-    return "\n".join(f"- `eval/{name}`: {TERMS[term]}{more}" for name, term, more in _TERM_OF)
+def _explained(figure: Figure) -> str:
+    unit = f" [{figure.unit}]" if figure.unit and figure.scale == 1 else ""
+    better = f"; {figure.better} is better" if figure.better else ""
+    return f"- `eval/{figure.name}`{unit}: {figure.meaning}{better}"

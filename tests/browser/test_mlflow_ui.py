@@ -21,8 +21,6 @@ from avp_habitat import command
 from avp_habitat.collect import Collect, collect
 from avp_habitat.task.settings import TaskSettings
 from avp_habitat.tracking import compare
-from avp_habitat.tracking.comparison import COLUMNS, collect_runs, markdown
-from avp_habitat.tracking.comparison import compare as compare_runs
 from avp_habitat.tracking.view import EVALUATIONS, path_of
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -203,7 +201,7 @@ def test_the_pictures_of_a_reconstruction_are_seen(browser, server, store, recon
 
 def test_the_comparison_is_a_table_on_the_page(browser, server, store):
     (run,) = (run for run in store.runs if run.data.tags.get("avp.kind") == "comparison")
-    methods = compare_runs(collect_runs(store.client, store.experiment))
+    methods = compare.compare(store.client, store.experiment)
     assert len(methods) == 5
     page_of_run = f"#/experiments/{store.experiment}/runs/{run.info.run_id}"
     with opened(browser, server, page_of_run) as page:
@@ -211,8 +209,8 @@ def test_the_comparison_is_a_table_on_the_page(browser, server, store):
         described = page.locator("table", has_text="PSNR [dB]").first.evaluate(
             "table => [...table.rows].map(row => [...row.cells].map(cell => cell.innerText.trim()))"
         )
-    assert described == [list(COLUMNS), *(method.cells() for method in methods)]
-    assert all(cell in markdown(methods) for row in described for cell in row)
+    assert described == [list(compare.COLUMNS), *(method.cells() for method in methods)]
+    assert all(cell in compare.markdown(methods) for row in described for cell in row)
     with opened(browser, server, f"{page_of_run}/artifacts/comparison.json") as page:
         page.get_by_text("avp-nerfacto").first.wait_for()
         for method in methods:

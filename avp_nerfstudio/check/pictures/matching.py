@@ -12,6 +12,7 @@ import pycolmap
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from avp_habitat import command
 from avp_habitat.errors import RolloutError
 from avp_habitat.rollout.format import Rollout
 from avp_habitat.rollout.png import check_png_contents
@@ -116,7 +117,7 @@ def _candidates(count: int) -> list[tuple[int, int]]:
 
 
 def _bar(total: int, text: str, unit: str, *, progress: bool) -> tqdm:
-    return tqdm(total=total, desc=text, unit=unit, disable=None if progress else True)
+    return command.progress(total=total, desc=text, unit=unit, disable=not progress)
 
 
 def _extract(database: Path, folder: Path, names: list[str], *, progress: bool) -> list[NDArray[np.float64]]:
