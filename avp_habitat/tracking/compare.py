@@ -82,6 +82,8 @@ class Method:
     """By name of the figure; what no run has is missing."""
     halves: Mapping[str, float]
     """Half of the 95 % interval, where more than one run or episode tells of the spread."""
+    further: tuple[Figure, ...] = ()
+    """A user's metrics among them."""
 
     def cells(self, shown: Sequence[Figure]) -> list[str]:
         """The row, with these figures."""
@@ -92,12 +94,13 @@ class Method:
         return [self.policy, self.scene, self.method, str(self.runs), *texts]
 
 
-def compare(client: "MlflowClient", experiment_id: str) -> list[Method]:
+def compare(client: "MlflowClient", experiment_id: str, metrics: Sequence[str] = ()) -> list[Method]:
     """What an experiment's reconstructions, rollouts and evaluations (of its first 50,000 runs) say of each method.
 
     Args:
         client: of the store.
         experiment_id: where to look.
+        metrics: of the user, for those that no distribution registers.
 
     Returns:
         Rows by scene; within it those with a reconstruction first, the best PSNR at the top, then by coverage.
@@ -114,12 +117,14 @@ def compare(client: "MlflowClient", experiment_id: str) -> list[Method]:
         if told and tags.get(KIND_TAG) != COMPARISON and run.info.run_id not in rollouts:
             method = tags.get(METHOD_TAG) or tags.get(KIND_TAG) or EVALUATION
             groups[tags[POLICY_TAG], tags.get(SCENE_TAG, "?"), method].append(metrics)
-    return sorted((_method(*key, group) for key, group in groups.items()), key=_rank)
+    return sorted((_method(*key, group, figures(metrics)) for key, group in groups.items()), key=_rank)
 
 
-def _method(policy: str, scene: str, method: str, runs: Sequence[Mapping[str, float]]) -> Method:
+def _method(
+    policy: str, scene: str, method: str, runs: Sequence[Mapping[str, float]], known: Mapping[str, Figure]
+) -> Method:
     means, halves = {}, {}
-    for name in [figure.name for figure in _ALWAYS] + [name for name in figures() if name not in FIGURES]:
+    for name in [figure.name for figure in _ALWAYS] + [name for name in known if name not in FIGURES]:
         values = [run[f"eval/{name}"] for run in runs if f"eval/{name}" in run]
         if values:
             mean, half = mean_and_half_width(values)
@@ -128,7 +133,8 @@ def _method(policy: str, scene: str, method: str, runs: Sequence[Mapping[str, fl
             halves[name] = float(half) if len(values) > 1 else runs[0].get(f"eval/{name}_ci95", math.nan)
     coverages, views = ([run[name] for run in runs] for name in ("eval/coverage", "eval/views"))
     means["cpv"] = coverage_per_view(coverages, views)  # type: ignore[arg-type]
-    return Method(policy, scene, method, len(runs), means, {**halves, "cpv": math.nan})
+    further = tuple(figure for name, figure in known.items() if name not in FIGURES and name in means)
+    return Method(policy, scene, method, len(runs), means, {**halves, "cpv": math.nan}, further)
 
 
 def _rank(method: Method) -> tuple[Any, ...]:
@@ -138,8 +144,7 @@ def _rank(method: Method) -> tuple[Any, ...]:
 
 def rows(methods: Sequence[Method]) -> tuple[list[str], list[list[str]]]:
     """Head and rows of the table; a user's metric has a column where a run has it."""
-    further = [figure for name, figure in figures().items() if name not in FIGURES]
-    shown = [*_ALWAYS, *(one for one in further if any(one.name in method.means for method in methods))]
+    shown = list(dict.fromkeys([*_ALWAYS, *(figure for method in methods for figure in method.further)]))
     head = ["policy", "scene", "method", "runs", *(figure.heading for figure in shown)]
     return head, [method.cells(shown) for method in methods]
 
@@ -274,7 +279,7 @@ def _experiment(client: "MlflowClient", option: str | None) -> "Experiment":
 
 
 def _methods(client: "MlflowClient", experiment: "Experiment", options: Compare) -> list[Method]:
-    methods = compare(client, experiment.experiment_id)
+    methods = compare(client, experiment.experiment_id, options.metrics)
     if not methods:
         raise AVPError(
             f"experiment {experiment.name!r} at {shown(client.tracking_uri)} has no run with eval/coverage, eval/views "
