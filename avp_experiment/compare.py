@@ -16,6 +16,7 @@ from avp_experiment.folder import open_folder
 from avp_experiment.runner import PRELOAD, Runner, environment
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
+from avp_habitat.metrics import METRICS_HELP, find_metrics
 from avp_habitat.scenes.location import UP_HELP
 from avp_habitat.simulators.registry import SIMULATORS, SimulatorChoice
 
@@ -42,6 +43,7 @@ class Compare:
     starts: str = AUTO
     """Episodes of each method, scene and seed; auto: the preset's number."""
     methods: Annotated[str, arg(help=_METHODS)] = AUTO
+    metrics: Annotated[str, arg(help=f"with commas between, or none: {METRICS_HELP}")] = NONE
     simulator: Annotated[str, arg(help=f"{', '.join(SIMULATORS)} or MODULE:FACTORY")] = "raycast"
     up: Annotated[str | None, arg(help=UP_HELP)] = None
     out: str = AUTO
@@ -63,8 +65,10 @@ class Compare:
         preset = replace(preset, seeds=_number("seeds", self.seeds, preset.seeds))
         preset = replace(preset, starts=_number("starts", self.starts, preset.starts))
         choice = SimulatorChoice(self.simulator, up=self.up)
-        scenes = read_scenes(_split(self.scene), [] if self.unseen == NONE else _split(self.unseen), choice)
-        return Configuration(self.preset, preset, scenes, methods, self.simulator, self.up)
+        metrics = _split(self.metrics)
+        find_metrics(metrics)
+        scenes = read_scenes(_split(self.scene), _split(self.unseen), choice)
+        return Configuration(self.preset, preset, scenes, methods, tuple(metrics), self.simulator, self.up)
 
     @property
     def line(self) -> str:
@@ -79,7 +83,7 @@ class Compare:
 
 
 def _split(text: str) -> list[str]:
-    return [part.strip() for part in text.split(",") if part.strip()]
+    return [part.strip() for part in text.split(",") if part.strip() not in ("", NONE)]
 
 
 def _number(option: str, text: str, auto: int) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from avp_experiment.results import Key, Results
-from avp_habitat.metrics import CONFIDENCE, FIGURES, Figure, mean_and_half_width
+from avp_habitat.metrics import CONFIDENCE, Figure, mean_and_half_width
 
 RESAMPLES = 2000
 _BOOTSTRAP_SEED = 0
@@ -29,9 +29,8 @@ class Summary:
         """Its ends; nan for one seed."""
         return self.mean - self.half_width, self.mean + self.half_width
 
-    def text(self, name: str, *, sign: bool = False) -> str:
-        """Mean ± half the interval, without ± for one seed, as the figure of this name is shown; no unit."""
-        figure = figure_named(name)
+    def text(self, figure: Figure, *, sign: bool = False) -> str:
+        """Mean ± half the interval, without ± for one seed, as a figure is shown; no unit."""
         shown = figure.text(self.mean, self.half_width)
         return f"+{shown}" if sign and not shown.startswith("-") else shown
 
@@ -53,11 +52,6 @@ class Correlation:
         """As ρ = 0.91 [0.85, 0.95]."""
         interval = "" if np.isnan(self.low) else f" [{self.low:.2f}, {self.high:.2f}]"
         return f"ρ = {self.rho:.2f}{interval}"
-
-
-def figure_named(name: str) -> Figure:
-    """How a figure is shown; one that a user added, by its name."""
-    return FIGURES.get(name) or Figure(name, name.replace("_", " "), digits=3)
 
 
 def per_seed(values: Mapping[Key, float]) -> dict[int, float]:

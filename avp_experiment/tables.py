@@ -9,7 +9,7 @@ import numpy as np
 
 from avp_experiment.configuration import ROOMS, TRAIN
 from avp_experiment.results import Key, Results
-from avp_experiment.statistics import Summary, figure_named, summary
+from avp_experiment.statistics import Summary, summary
 from avp_habitat.metrics import FIGURES, Figure
 from avp_habitat.tables import table
 
@@ -36,7 +36,7 @@ class Table:
         """With mean ± half the 95 % confidence interval over seeds, and the notes below."""
         head = ["method", *(column.heading for column in self.columns)]
         rows = [
-            [method, *(found.text(name) if found else NOTHING for name, found in cells.items())]
+            [method, *(found.text(column) if (found := cells[column.name]) else NOTHING for column in self.columns)]
             for method, cells in self.rows.items()
         ]
         return "\n".join([table(head, rows, words=1), *(f"\n{note}" for note in self.notes)]) + "\n"
@@ -56,24 +56,20 @@ class Table:
 
 def make_table(results: Results, role: str) -> Table | None:
     """The table of the scenes of a role; None where no method has an episode there."""
-    known = dict.fromkeys(name for one in results.rollouts for name in one.metrics)
-    # `return_NAME` is a part of the reward, not a figure.
-    names = (*COLUMNS, *(name for name in known if name not in FIGURES and not name.startswith("return_")))
-    found = {method: {name: results.values(method, role, name) for name in names} for method in results.methods}
+    figures = {name: FIGURES[name] for name in COLUMNS} | dict(results.figures)
+    found = {method: {name: results.values(method, role, name) for name in figures} for method in results.methods}
     found = {method: values for method, values in found.items() if values["coverage"]}
     if not found:
         return None
-    shown = [name for name in names if any(values[name] for values in found.values())]
+    shown = [name for name in figures if any(values[name] for values in found.values())]
     rows = {method: {name: summary(values[name]) for name in shown} for method, values in found.items()}
-    missing = [
-        f"No {figure_named(name).heading}: {_why_missing(results, name)}." for name in names if name not in shown
-    ]
+    missing = [f"No {figures[name].heading}: {_why_missing(results, name)}." for name in figures if name not in shown]
     return Table(
-        columns=tuple(figure_named(name) for name in shown),
+        columns=tuple(figures[name] for name in shown),
         rows=rows,
         episodes={method: len(values["coverage"]) for method, values in found.items()},
         notes=(
-            *(f"No {figure_named(name).heading}: {_why_missing(results, name)}." for name in missing),
+            *(f"No {figures[name].heading}: {_why_missing(results, name)}." for name in missing),
             *_notes(results, role, found),
         ),
     )
