@@ -17,6 +17,7 @@ PAIRS = (("surface", "proposed"), (f"surface{ROOMS}", f"proposed{ROOMS}"))
 FEWER_VIEWS, WORSE_DB, GOOD_RHO = 0.25, 0.3, 0.8
 """What the paper's method is held to: at least so many fewer views at no more than so much lower PSNR; and what a
 predictor of PSNR is held to."""
+VIEWS, COVERAGE, PSNR = (FIGURES[name] for name in ("views", "coverage", "psnr"))
 _WHERE = {TRAIN: "in the scenes of training", UNSEEN: "in unseen scenes"}
 Curves = dict[Key, dict[int, float]]
 """PSNR in dB by number of views, ascending, by episode."""
@@ -95,8 +96,8 @@ def _fewer_views(results: Results) -> list[str]:
             continue
         taken = " against ".join(map(_mean, views))
         lines.append(
-            f"{where} `proposed` takes {saved.text(FIGURES['coverage'])} % fewer views than `coverage` ({taken}); its PSNR "
-            f"differs by {difference.text(FIGURES['psnr'], sign=True)} dB. At least {100 * FEWER_VIEWS:.0f} % fewer views at a "
+            f"{where} `proposed` takes {saved.text(COVERAGE)} % fewer views than `coverage` ({taken}); its PSNR "
+            f"differs by {difference.text(PSNR, sign=True)} dB. At least {100 * FEWER_VIEWS:.0f} % fewer views at a "
             f"PSNR no more than {WORSE_DB} dB lower: {_holds(saved, difference)}"
         )
     return lines
@@ -164,7 +165,7 @@ def _curves(results: Results, method: str, role: str) -> Curves:
 
 
 def _equal_views(difference: Summary) -> str:
-    by = difference.text(FIGURES["psnr"], sign=True)
+    by = difference.text(PSNR, sign=True)
     shown = f"at the smaller of their numbers of views its PSNR differs by {by} dB"
     higher = "higher" if difference.mean > 0 else "not higher"
     if np.isnan(difference.half_width):
@@ -255,4 +256,4 @@ def _difference(found: Summary | None, name: str) -> str:
 
 def _mean(views: Mapping[Key, float]) -> str:
     found = statistics.summary(views)
-    return found.text(FIGURES["views"]) if found else NOTHING
+    return found.text(VIEWS) if found else NOTHING

@@ -222,7 +222,7 @@ def _scatter(axes: "Axes", points: Sequence[Point], name: str) -> None:
         if not chosen:
             continue
         colour, marker, line = style_of(chosen[0].method)
-        look = {"marker": marker, "edgecolors": colour, "facecolors": colour if line == "-" else "none"}
+        look: dict[str, Any] = {"marker": marker, "edgecolors": colour, "facecolors": colour if line == "-" else "none"}
         look |= {"s": 46, "alpha": 0.9} if whole else {"s": 16, "alpha": 0.4}
         shares = [FIGURES[name].scale * point.shares[name] for point in chosen]
         label = chosen[0].method if whole or len(chosen) == len(points) else None

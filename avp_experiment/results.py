@@ -240,13 +240,13 @@ def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], 
         The content.
     """
     done = [(cell, record) for cell in cells if (record := folder.record(cell)) is not None]
+    known = figures(configuration.metrics)
+    measured = {name for cell, record in done if cell.kind == COLLECT for name in record["facts"]["metrics"]}
     results = {
         "format": FORMAT,
         "configuration": configuration.as_json(),
         "methods": [method.name for method in configuration.methods],
-        "figures": {
-            name: asdict(figure) for name, figure in figures(configuration.metrics).items() if name not in FIGURES
-        },
+        "figures": {name: asdict(known[name]) for name in sorted(measured & set(known) - set(FIGURES))},
         "origin": {
             "command": command,
             "commits": sorted({record["commit"] for _, record in done if record["commit"]}),

@@ -63,7 +63,7 @@ def make_table(results: Results, role: str) -> Table | None:
         return None
     shown = [name for name in figures if any(values[name] for values in found.values())]
     rows = {method: {name: summary(values[name]) for name in shown} for method, values in found.items()}
-    missing = [f"No {figures[name].heading}: {_why_missing(results, name)}." for name in figures if name not in shown]
+    missing = [name for name in figures if name not in shown]
     return Table(
         columns=tuple(figures[name] for name in shown),
         rows=rows,
