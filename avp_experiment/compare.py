@@ -113,25 +113,25 @@ def compare(configuration: Configuration, out: Path, *, jobs: int, line: str) ->
     folder = open_folder(configuration, out)
     with folder.alone():
         folder.check_disk(plan(configuration, out, tracking="?"), configuration)
-        parent = open_parent(f"compare {configuration.preset_name}")
+        parent, experiment = open_parent(f"compare {configuration.preset_name}")
         status = "FAILED"
         try:
-            cells = plan(configuration, out, tracking=parent.experiment)
+            cells = plan(configuration, out, tracking=experiment)
             preload = () if SimulatorChoice(configuration.simulator).one_per_process else PRELOAD
             runner = Runner(folder, jobs, environment(tracking_uri()), preload)
             runner.run(cells)
             results = gather(configuration, folder, cells, command=line)
             write_report(out)
-            log_results(parent, results, out)
+            log_results(parent, experiment, results, out)
             status = "FINISHED"
         except KeyboardInterrupt:
             status = "KILLED"
             print(f"\nwhat is done is kept in {out}; to go on:  {line}", file=sys.stderr)
             raise
         finally:
-            parent.run.close(status)
+            parent.close(status)
     print(f"results:      {out}/results.md (tables, figures, claims; from {out}/results.json)")
-    print(f"MLflow run:   {parent.run.run_id}")
+    print(f"MLflow run:   {parent.run_id}")
     if runner.failed:
         raise AVPError(
             f"{len(runner.failed)} of {len(cells)} cells failed (reasons: {out}/results.md); "
