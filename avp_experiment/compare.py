@@ -23,7 +23,6 @@ from avp_habitat.simulators.registry import SIMULATORS, SimulatorChoice
 AUTO = "auto"
 NONE = "none"
 _METHODS = f"with commas between: policies, rewards, rewards with {ROOMS}, module:object; auto: {', '.join(DEFAULT)}"
-_METHODS = f"with commas between: policies, rewards, and rewards with {ROOMS}; auto: {', '.join(DEFAULT)}"
 
 
 @dataclass(frozen=True)
