@@ -10,7 +10,6 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.writer import EventName, Writer
 
 from avp_habitat.tracking.deliver import recover_in_background
-from avp_habitat.tracking.journal import spool_folder
 from avp_habitat.tracking.names import OFFLINE
 from avp_habitat.tracking.run import Status, TrackedRun
 from avp_habitat.tracking.stores import about_run
@@ -118,7 +117,7 @@ class Trackers:
             earlier=remembered_id(config.load_dir.parent) if config.load_dir is not None else None,
         )
         print(about_run(run.run_id, run.address, delivered=not run.run_id.startswith(OFFLINE)))
-        recover_in_background(spool_folder())
+        recover_in_background()
         return cls(run, recording)
 
     def listen(self, every: int) -> None:

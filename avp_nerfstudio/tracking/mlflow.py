@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from avp_habitat.tracking.deliver import finish
 from avp_habitat.tracking.experiments import find_run
-from avp_habitat.tracking.journal import Journal, journal_of, spool_folder
+from avp_habitat.tracking.journal import Journal, journal_of
 from avp_habitat.tracking.names import CONTINUED_TAG, POLICY_RUN_TAG, ROLLOUT_RUN_TAG
 from avp_habitat.tracking.rollout_run import rollout_run
 from avp_habitat.tracking.run import NewRun, TrackedRun, continue_run, join_run, may_continue, start_run
@@ -106,7 +106,7 @@ def _again(client: "MlflowClient | None", address: str, run_id: str) -> TrackedR
 
 def _deliver_left(run_id: str) -> None:
     """Send what a run could not send while it lasted, and close it if its program was killed."""
-    folder = journal_of(spool_folder(), run_id)
+    folder = journal_of(run_id)
     journal = None if folder is None else Journal.adopt(folder)
     if journal is not None:
         finish(journal)

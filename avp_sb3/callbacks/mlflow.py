@@ -22,7 +22,6 @@ from stable_baselines3.common.logger import Figure, Image, KVWriter
 from avp_habitat.errors import UsageError
 from avp_habitat.provenance import flat
 from avp_habitat.tracking.deliver import recover_in_background
-from avp_habitat.tracking.journal import spool_folder
 from avp_habitat.tracking.names import CONTINUED_TAG, KIND_TAG, RESUMED_TAG
 from avp_habitat.tracking.run import NewRun, Status, TrackedRun, continue_run, join_run, may_continue, start_run
 from avp_habitat.tracking.stores import DEFAULT_ADDRESS, about_run, shown
@@ -231,7 +230,7 @@ class MLflowCallback(BaseCallback):
         self._writer = MLflowWriter(run)
         self.logger.output_formats.append(self._writer)
         self._saved_at = time.monotonic()
-        recovery = recover_in_background(spool_folder())
+        recovery = recover_in_background()
         # The usual case, a store on this machine, is a matter of milliseconds; a slow server is not waited for.
         recovery.join(0.5)
         if self.verbose > 1:
