@@ -229,7 +229,7 @@ def test_a_disk_that_takes_no_journal_is_said_and_the_points_arrive(address, mon
         run.metrics({"a": 1.0}, 1)
         run.image("map", np.zeros((4, 5, 3), dtype=np.uint8), 1)
         assert run.close("FINISHED")
-    assert "cannot be kept on disk" in caplog.text
+    assert "cannot be kept on disk at" in caplog.text
     assert points(address, run.run_id, "a") == [(1, 1.0)]
     assert len(MlflowClient(address).list_artifacts(run.run_id, "images")) == 2
 

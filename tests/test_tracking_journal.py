@@ -131,7 +131,7 @@ def test_where_the_disk_takes_nothing_the_journal_is_a_temporary_one(tmp_path, m
     journal.remove()
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "file"))
-    with pytest.raises(TrackingError, match="cannot be kept on disk: .*k1: Not a directory; .*k1: Not a directory"):
+    with pytest.raises(TrackingError, match=r"cannot be kept on disk: .*k1: Not a directory; .*k1: Not a directory"):
         Journal.create(HEADER)
 
 

@@ -40,10 +40,7 @@ class TrackedRun:
         self._journal = journal
         self._names = SafeNames()
         self._sender = Sender(journal, client, **options)
-        if (problem := journal.problem) is not None:
-            self._sender.warn_once(
-                "disk", f"MLflow's points cannot be kept on disk ({problem}), only in {journal.folder}"
-            )
+        self._warn_of_disk()
 
     @property
     def run_id(self) -> str:
@@ -155,8 +152,11 @@ class TrackedRun:
 
     def _append(self, entry: dict[str, Any]) -> None:
         self._journal.append(entry)
-        if self._journal.problem is not None:
-            self._sender.warn_once("disk", f"MLflow's points cannot be kept on disk now ({self._journal.problem})")
+        self._warn_of_disk()
+
+    def _warn_of_disk(self) -> None:
+        if (problem := self._journal.problem) is not None:
+            self._sender.warn_once("disk", f"MLflow's points cannot be kept on disk at {problem}")
 
 
 @dataclass(frozen=True)
