@@ -7,13 +7,10 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
-
-from tyro.conf import arg
 
 from avp_habitat import command
 from avp_habitat.errors import UsageError
-from avp_habitat.tracking.journal import SPOOL_VARIABLE, Journal, headers, spool_folder
+from avp_habitat.tracking.journal import Journal, headers, spool_folder
 from avp_habitat.tracking.run import TrackedRun
 from avp_habitat.tracking.stores import TrackingError, absolute, shown
 
@@ -77,9 +74,8 @@ class Deliver:
     Runs whose program was killed are closed. Each point arrives once, however often this is run.
     """
 
-    spool: Annotated[Path | None, arg(help=f"Where they wait (omitted: {SPOOL_VARIABLE}, else runs/mlflow-spool).")] = (
-        None
-    )
+    spool: Path | None = None
+    """Where they wait (omitted: AVP_MLFLOW_SPOOL, else runs/mlflow-spool)."""
     mlflow: str | None = None
     """Send them to this address instead of where they were meant for."""
     again: bool = False
@@ -109,7 +105,8 @@ def _deliver(spool: Path, count: int, options: Deliver) -> None:
         if options.mlflow is not None:
             journal.header["address"] = absolute(options.mlflow)
         done.append(finish(journal, again=options.again, timeout_s=_PATIENCE_S))
-    print(*(line for _, line in done), sep="\n")
+    for _, line in done:
+        print(line)
     if busy := count - len(done):
         print(f"{busy} of {count} belong to programs that still run")
     if failed := sum(not delivered for delivered, _ in done):

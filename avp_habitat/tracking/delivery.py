@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from avp_habitat.tracking.experiments import create_run
 from avp_habitat.tracking.journal import Journal
 from avp_habitat.tracking.names import CHANGED_TAG, MAX_TAG
-from avp_habitat.tracking.stores import StoreUnreachableError, TrackingError, connect, first_line, shown, unreachable
+from avp_habitat.tracking.stores import StoreUnreachableError, connect, first_line, shown, unreachable
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -162,9 +162,12 @@ class Sender:
         self._send_values(entries)
         # Of files that replace each other the last one is enough. A run ends after everything else.
         files = {entry["path"]: entry for entry in entries if "file" in entry}
-        others = [entry for entry in entries if not entry.keys() & {*_PER_CALL, "file"}]
-        for entry in [*files.values(), *others]:
-            self._call(entry, partial(self._send_file if "file" in entry else self._end, entry))
+        for entry in files.values():
+            self._call(entry, partial(self._send_file, entry))
+        for entry in entries:
+            if "end" in entry:
+                how = (self._run_id, entry["end"], entry["at"])
+                self._call(entry, partial(self._client.set_terminated, *how))
 
     def _send_values(self, entries: Sequence[Mapping[str, Any]]) -> None:
         from mlflow.entities import Metric, Param, RunTag
@@ -209,19 +212,14 @@ class Sender:
         if (source := self._file_of(entry)).is_file():
             self._client.log_artifact(self._run_id, str(source), None if folder == "." else folder)
 
-    def _end(self, entry: Mapping[str, Any]) -> None:
-        if "end" not in entry:
-            raise TrackingError("nobody can read this line")
-        self._client.set_terminated(self._run_id, entry["end"], entry["at"])
-
     def _call(self, entry: Mapping[str, Any], call: Callable[[], object]) -> None:
         """Call MLflow; an entry that it refuses for good is kept as rejected."""
         from mlflow.exceptions import MlflowException
 
         try:
             call()
-        except (MlflowException, TrackingError) as error:
-            if isinstance(error, MlflowException) and error.error_code not in _PERMANENT.split():
+        except MlflowException as error:
+            if error.error_code not in _PERMANENT.split():
                 raise
             reason = first_line(error)
             self._journal.reject(entry, reason)

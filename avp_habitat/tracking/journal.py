@@ -13,7 +13,7 @@ import shutil
 import tempfile
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -58,9 +58,7 @@ class Journal:
         self._waiting: deque[dict[str, Any]] = deque()
         self._descriptors: list[int] = []
         self._file = self._mark = -1
-        self._size = self._sent = 0
-        self._read_to = 0
-        self._read_waiting = 0
+        self._size = self._sent = self._read_to = self._read_waiting = 0
         self.problem: str | None = None
         """Why the disk takes nothing; None while it does."""
 
@@ -150,7 +148,7 @@ class Journal:
                 data += os.pread(self._file, _CHUNK, self._sent + len(data))
             data = data[: data.rindex(b"\n") + 1]
             self._read_to, self._read_waiting = self._sent + len(data), 0
-            return [_parsed(line) for line in data.splitlines()]
+            return list(_parsed(data))
 
     def acknowledge(self) -> None:
         """Note that MLflow has what `read` gave last."""
@@ -183,8 +181,8 @@ class Journal:
         """Put refused entries back, to be tried again."""
         if self.has_rejected:
             path = self.folder / _REJECTED
-            for line in path.read_bytes().splitlines():
-                self.append({key: value for key, value in _parsed(line).items() if key != "reason"})
+            for entry in _parsed(path.read_bytes()):
+                self.append({key: value for key, value in entry.items() if key != "reason"})
             path.unlink()
 
     @property
@@ -267,10 +265,8 @@ def _whole_lines(file: int) -> int:
     return end
 
 
-def _parsed(line: bytes) -> dict[str, Any]:
-    """An entry; `damaged` holds a line that is none."""
-    try:
-        entry = json.loads(line)
-    except ValueError:
-        entry = None
-    return entry if isinstance(entry, dict) else {"damaged": line.decode(errors="replace")}
+def _parsed(data: bytes) -> Iterator[dict[str, Any]]:
+    """The entries of some lines; a damaged one, which only losing the machine leaves, is left out."""
+    for line in data.splitlines():
+        with suppress(ValueError):
+            yield json.loads(line)

@@ -166,7 +166,7 @@ class NewRun:
     experiment: str | None = None
     """Made when it does not exist; as `experiments.chosen_experiment` says when None."""
     name: str | None = None
-    """Of the run; MLflow invents one when None, the same one after each training that was seeded alike."""
+    """MLflow invents one when None, the same one after each training that was seeded alike."""
     tags: Mapping[str, str] = field(default_factory=dict)
     """Beside those of MLflow's run context."""
     parent: str | None = None

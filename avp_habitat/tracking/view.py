@@ -74,20 +74,19 @@ _ALWAYS = json.loads("""{
 
 @dataclass(frozen=True)
 class View:
-    """A view of the runs page."""
+    """A view of the runs page.
+
+    `key` names it in addresses, `title` in the page's menu; `runs` is MLflow's filter of the runs that it shows.
+    `columns` of its table are metrics as `eval/psnr`, tags as `avp.policy` and parameters as `env.reward`; by `order`,
+    one of them, runs are sorted, the largest first. `charts` are groups by title, from top to bottom.
+    """
 
     key: str
-    """Names it in addresses."""
     title: str
-    """In the page's menu of views."""
     runs: str
-    """MLflow's search filter of the runs that it shows."""
     columns: str
-    """Of its table, from left to right: metrics as `eval/psnr`, tags as `avp.policy`, parameters as `env.reward`."""
     order: str
-    """Column by which runs are sorted, the largest first."""
     charts: dict[str, list[Chart]]
-    """Groups by title, from top to bottom."""
 
     def tag(self, created_ms: int) -> str:
         """Value of the experiment's tag that holds it, as MLflow's page keeps it."""
