@@ -79,8 +79,7 @@ class Sender:
     def drain(self, timeout_s: float) -> bool:
         """Send everything without waiting for the interval; whether MLflow has it.
 
-        Args:
-            timeout_s: to wait at most without any progress; a server that is gone is asked twice more instead.
+        It waits at most so long without any progress; a server that is gone is asked twice more instead.
         """
         unanswered, failures = self._unanswered + _ASKED_AGAIN, self._failures + _FAILED_AGAIN
         answers, until = self._answers, time.monotonic() + timeout_s

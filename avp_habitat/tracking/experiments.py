@@ -19,7 +19,7 @@ _NOT_THERE = ("RESOURCE_DOES_NOT_EXIST", "INVALID_PARAMETER_VALUE")
 
 
 def chosen_experiment(option: str | None) -> tuple[str | None, str | None]:
-    """The name or the id of the experiment that runs go to; one of them is None.
+    """The name, or else the id, of the experiment that runs go to.
 
     The option, else what MLflow's variables say, which `mlflow.set_experiment` sets too, else `avp`.
     """

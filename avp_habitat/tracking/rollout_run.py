@@ -47,19 +47,15 @@ _ORIGIN = {
 
 
 def rollout_run(store: "MlflowClient | str", folder: str | Path, *, experiment: str | None = None) -> str:
-    """The MLflow run of a rollout, which is made when the store has none.
+    """The id of the MLflow run of a rollout, which is made when the store has none.
 
     A rollout is recognised by its contents (`rollout_id`), wherever its folder lies. Its run is a child of the run
-    that trained the policy, in the experiment of that, when the store has it.
+    that trained the policy, in the experiment of that; or else in that of `experiments.chosen_experiment`.
 
     Args:
         store: its client, or its address.
         folder: of the rollout, or its `rollout.json`.
-        experiment: of a rollout whose policy's run the store does not have; as `experiments.chosen_experiment` says
-            when omitted.
-
-    Returns:
-        The run's id.
+        experiment: of a rollout whose policy's run the store does not have.
 
     Raises:
         RolloutError: the rollout cannot be read.

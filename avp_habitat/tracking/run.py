@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal
 from uuid import uuid4
@@ -77,12 +78,7 @@ class TrackedRun:
             self._append({"params": {safe_name(name): str(value)[:MAX_PARAM] for name, value in values.items()}})
 
     def save(self, path: str, write: Callable[[Path], object]) -> bool:
-        """Keep an artifact that `write` writes to the file that it is given; whether the disk took it.
-
-        Args:
-            path: of the artifact within the run; one of the same name is replaced.
-            write: given a path that ends like `path`, makes that file.
-        """
+        """Keep an artifact, in place of one of that path, that `write` writes to its file; whether the disk took it."""
         try:
             file = self._journal.new_file(PurePosixPath(path).name)
             write(file)
@@ -106,8 +102,8 @@ class TrackedRun:
         # By such names MLflow's UI knows a series of pictures: MlflowClient.log_image in mlflow/tracking/client.py.
         series = safe_name(name).replace("/", "~")
         stem = f"images/{series}+step+{step}+timestamp+{int(time.time() * 1000)}+{uuid4()}"
-        self.save(f"{stem}.png", lambda file: picture.save(file, compress_level=1))
-        self.save(f"{stem}+compressed.webp", lambda file: small.save(file, quality=80))
+        self.save(f"{stem}.png", partial(picture.save, compress_level=1))
+        self.save(f"{stem}+compressed.webp", partial(small.save, quality=80))
         self.tags({IMAGES_TAG: "True"})
 
     def flush(self, timeout_s: float = _CLOSING_S) -> bool:
@@ -174,17 +170,12 @@ class NewRun:
 
 
 def start_run(address: str, new: NewRun, *, offline: bool | None = None, **options: Any) -> TrackedRun:
-    """Begin a run.
+    """Begin a run; with `offline` although the store does not answer (None: as `AVP_MLFLOW_OFFLINE` says).
 
-    Args:
-        address: of the store.
-        new: what the run is made from.
-        offline: True begins although the store does not answer; the run is made when it does. None: as
-            `AVP_MLFLOW_OFFLINE` says.
-        **options: of `TrackedRun`.
+    The options are those of `Sender`, also below.
 
     Raises:
-        TrackingError: the store cannot be reached (and `offline` is not set), or refuses.
+        TrackingError: the store cannot be reached, or refuses.
     """
     client = open_store(address, offline=offline, option="offline=True")
     from mlflow.tracking.context.registry import resolve_tags
@@ -211,17 +202,10 @@ def start_run(address: str, new: NewRun, *, offline: bool | None = None, **optio
 
 
 def continue_run(address: str, run_id: str, *, offline: bool | None = None, **options: Any) -> TrackedRun:
-    """Go on with a run, with what its journal still holds when its process was killed.
-
-    Args:
-        address: of the store.
-        run_id: MLflow's, or the one given offline.
-        offline: as in `start_run`.
-        **options: of `Sender`.
+    """Go on with a run of MLflow's id or of one given offline, with what its journal still holds from a killed process.
 
     Raises:
-        TrackingError: the store cannot be reached (and `offline` is not set), or has no such run, or the run is being
-            written by another process.
+        TrackingError: the store cannot be reached, or has no such run, or another process is writing the run.
     """
     client = open_store(address, offline=offline, option="offline=True")
     folder = journal_of(run_id)

@@ -37,12 +37,7 @@ class StoreUnreachableError(TrackingError):
 
 
 def address_of(option: str, *, default: str | None) -> str | None:
-    """The address that an option means; None for no tracking.
-
-    Args:
-        option: an address, `auto` for `MLFLOW_TRACKING_URI`, or `off`.
-        default: of `auto` where that variable is not set.
-    """
+    """The address that an option means: itself, `auto` for `MLFLOW_TRACKING_URI` or else `default`; None for `off`."""
     if option == "off":
         return None
     return os.environ.get("MLFLOW_TRACKING_URI") or default if option == "auto" else option
@@ -97,12 +92,9 @@ def is_missing(address: str) -> bool:
 
 
 def open_store(address: str, *, offline: bool | None = None, option: str | None = None) -> "MlflowClient | None":
-    """A client of the store; None when it does not answer and we are told to go on without it.
+    """A client of the store; None when it does not answer and `offline`, or else `AVP_MLFLOW_OFFLINE`, allows that.
 
-    Args:
-        address: of the store.
-        offline: whether to go on without it; None as the variable `AVP_MLFLOW_OFFLINE` says.
-        option: how the caller's users say so, for the error's text, beside that variable.
+    `option` is how the caller's users say so beside that variable, for the error's text.
 
     Raises:
         TrackingError: the store cannot be used.
