@@ -28,18 +28,8 @@ from avp_habitat.metrics import (
     mean_and_half_width,
 )
 from avp_habitat.tables import table
+from avp_habitat.tracking import names
 from avp_habitat.tracking.experiments import DEFAULT_HELP, chosen_experiment, find_experiment
-from avp_habitat.tracking.names import (
-    COMPARISON,
-    EVALUATION,
-    KIND_TAG,
-    MAX_TAG,
-    METHOD_TAG,
-    NOTE_TAG,
-    POLICY_TAG,
-    ROLLOUT_RUN_TAG,
-    SCENE_TAG,
-)
 from avp_habitat.tracking.stores import (
     ADDRESS_HELP,
     DEFAULT_ADDRESS,
@@ -71,13 +61,9 @@ class Method:
     """One row: the runs of a policy in a scene, by one method."""
 
     policy: str
-    """Who took the views."""
     scene: str
-    """Where."""
     method: str
-    """nerfstudio's method, or `evaluation`."""
     runs: int
-    """How many."""
     means: Mapping[str, float]
     """By name of the figure; what no run has is missing."""
     halves: Mapping[str, float]
@@ -105,19 +91,20 @@ def compare(client: "MlflowClient", experiment_id: str, metrics: Sequence[str] =
     Returns:
         Rows by scene; within it those with a reconstruction first, the best PSNR at the top, then by coverage.
     """
+    known = figures(metrics)
     found = client.search_runs([experiment_id], "metrics.`eval/coverage` >= 0", max_results=_MOST_RUNS)
     # A reconstruction carries the figures of its rollout, which would otherwise count twice.
-    rollouts = {run.data.tags.get(ROLLOUT_RUN_TAG) for run in found}
+    rollouts = {run.data.tags.get(names.ROLLOUT_RUN_TAG) for run in found}
     groups: dict[tuple[str, str, str], list[dict[str, float]]] = defaultdict(list)
     for run in found:
-        metrics = {name: value for name, value in run.data.metrics.items() if math.isfinite(value)}
+        logged = {name: value for name, value in run.data.metrics.items() if math.isfinite(value)}
         tags = run.data.tags
         # A run without a policy is that of a training with evaluations in between.
-        told = tags.get(POLICY_TAG) and {"eval/coverage", "eval/views"} <= metrics.keys()
-        if told and tags.get(KIND_TAG) != COMPARISON and run.info.run_id not in rollouts:
-            method = tags.get(METHOD_TAG) or tags.get(KIND_TAG) or EVALUATION
-            groups[tags[POLICY_TAG], tags.get(SCENE_TAG, "?"), method].append(metrics)
-    return sorted((_method(*key, group, figures(metrics)) for key, group in groups.items()), key=_rank)
+        told = tags.get(names.POLICY_TAG) and {"eval/coverage", "eval/views"} <= logged.keys()
+        if told and tags.get(names.KIND_TAG) != names.COMPARISON and run.info.run_id not in rollouts:
+            method = tags.get(names.METHOD_TAG) or tags.get(names.KIND_TAG) or names.EVALUATION
+            groups[tags[names.POLICY_TAG], tags.get(names.SCENE_TAG, "?"), method].append(logged)
+    return sorted((_method(*key, group, known) for key, group in groups.items()), key=_rank)
 
 
 def _method(
@@ -182,23 +169,18 @@ def picture(methods: Sequence[Method], path: Path) -> bool:
 
 
 def keep(client: "MlflowClient", experiment_id: str, methods: Sequence[Method]) -> str:
-    """Make or renew the run that compares these methods; there is one for each set of scenes.
-
-    Args:
-        client: of the store.
-        experiment_id: where the run lies.
-        methods: at least one.
+    """Make or renew the run that compares these methods, one for each set of scenes; its id.
 
     Raises:
         MlflowException: the store refuses.
-
-    Returns:
-        The run's id.
     """
-    tags = {KIND_TAG: COMPARISON, SCENE_TAG: ", ".join(sorted({method.scene for method in methods}))[:MAX_TAG]}
-    of_kind = client.search_runs([experiment_id], f"tags.`{KIND_TAG}` = '{COMPARISON}'")
-    kept = [run for run in of_kind if run.data.tags.get(SCENE_TAG) == tags[SCENE_TAG]]
-    run = kept[0] if kept else client.create_run(experiment_id, run_name=COMPARISON, tags=tags)
+    tags = {
+        names.KIND_TAG: names.COMPARISON,
+        names.SCENE_TAG: ", ".join(sorted({method.scene for method in methods}))[: names.MAX_TAG],
+    }
+    of_kind = client.search_runs([experiment_id], f"tags.`{names.KIND_TAG}` = '{names.COMPARISON}'")
+    kept = [run for run in of_kind if run.data.tags.get(names.SCENE_TAG) == tags[names.SCENE_TAG]]
+    run = kept[0] if kept else client.create_run(experiment_id, run_name=names.COMPARISON, tags=tags)
     run_id = run.info.run_id
     try:
         client.log_dict(run_id, dict(zip(("columns", "data"), rows(methods), strict=True)), TABLE)
@@ -209,7 +191,7 @@ def keep(client: "MlflowClient", experiment_id: str, methods: Sequence[Method]) 
             for path in Path(folder).iterdir():
                 client.log_artifact(run_id, os.fspath(path))
         # The page shows it above everything else.
-        client.set_tag(run_id, NOTE_TAG, (markdown(methods) + _HOW_TO_READ)[:MAX_TAG])
+        client.set_tag(run_id, names.NOTE_TAG, (markdown(methods) + _HOW_TO_READ)[: names.MAX_TAG])
     finally:
         client.set_terminated(run_id)
     return run_id

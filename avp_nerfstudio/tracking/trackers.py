@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import UsageError
 from avp_habitat.tracking.deliver import recover_in_background
-from avp_habitat.tracking.journal import spool_folder
 from avp_habitat.tracking.names import OFFLINE
 from avp_habitat.tracking.run import Status, TrackedRun
 from avp_habitat.tracking.stores import about_run
@@ -202,7 +201,7 @@ class Trackers:
         experiment, folder = config.mlflow_experiment, config.get_base_dir()
         self._run = run = open_run(address, facts_of(config), folder=folder, experiment=experiment, earlier=earlier)
         print(about_run(run.run_id, run.address, delivered=not run.run_id.startswith(OFFLINE)))
-        recover_in_background(spool_folder())
+        recover_in_background()
 
     def listen(self, every: int) -> None:
         """Take nerfstudio's numbers from now on, those of each iteration only `every` so many."""
