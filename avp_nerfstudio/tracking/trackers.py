@@ -17,6 +17,7 @@ from nerfstudio.utils.writer import EventName, Writer
 from numpy.typing import NDArray
 
 from avp_habitat.errors import UsageError
+from avp_habitat.files import check_new
 from avp_habitat.tracking.deliver import recover_in_background
 from avp_habitat.tracking.names import OFFLINE
 from avp_habitat.tracking.run import Status, TrackedRun
@@ -96,8 +97,7 @@ class ReconstructionRecording:
             UsageError: the file exists or cannot be written, or Rerun is not installed.
         """
         rr = _rerun()
-        if path.exists():
-            raise UsageError(f"--rerun {path}: exists already; choose another name or remove it")
+        check_new(path, option="--rerun")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch()
