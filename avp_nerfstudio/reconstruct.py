@@ -78,8 +78,7 @@ def reconstruct(options: Reconstruction) -> dict[str, Any]:
             warnings.simplefilter("ignore")
             from avp_nerfstudio.method.reconstruction import process
 
-            found = process(options, rollout, folder, started=started, address=address)
-    return found
+            return process(options, rollout, folder, started=started, address=address)
 
 
 def _check_rollout(options: Reconstruction, rollout: Rollout) -> None:

@@ -103,7 +103,7 @@ def test_the_commands_of_the_page_run_as_written_from_outside(site, tmp_path):
     lines = [words for words in COMMANDS if words[0] == "python" and "avp_sb3.train" not in words]
     assert len(lines) == 6
     said = outside(site, tmp_path, sys.executable, "-c", DRIVER, json.dumps(lines))
-    assert "reward/new floor" in said
+    assert re.search(r"\|    new floor +\| [\d.]+ ", said)
     rollouts = {
         name: json.loads((tmp_path / "runs" / name / "rollout.json").read_text()) for name in ("r1", "r2", "r3")
     }

@@ -23,8 +23,6 @@ LIGHT = (
     "ranges",
     "rollout.format",
     "rollout.images",
-    "sight.rules",
-    "sight.visibility",
     "task.rewards",
     "task.trajectory",
 )

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.compiled import njit
+from avp_habitat.metrics import ALIKE_DEG, ALIKE_DISTANCE, PARALLAX_DEG
 from avp_habitat.poses import Intrinsics, pixel_directions
 from avp_habitat.sight.rules import camera_numbers, in_camera, in_image, inverse_depths
 
@@ -29,12 +30,6 @@ TOLERANCE_SHARE = 0.005
 """Or this close as a share of the depth, whichever is more."""
 PIXELS_PER_VIEW = 1200
 """About so many pixels of each held-out view are tested by default: every 16th row and column of 640x480."""
-ALIKE_DEG = 60.0
-"""A frame sees a surface as the held-out view does when its ray is turned by no more than this, degrees."""
-ALIKE_DISTANCE = 2.0
-"""And when it stands no more than this many times as far away."""
-PARALLAX_DEG = 10.0
-"""Rays this far apart show how far away a surface is, degrees."""
 
 # Multiples of these, without their whole parts, fill the unit square evenly: the powers of 1 / 1.3247…, the root of
 # x³ = x + 1 (the R2 sequence).

@@ -59,7 +59,7 @@ def process(
     Args:
         options: held to the rollout.
         rollout: the one they name, as read.
-        folder: where to write now; `options.out` in the end.
+        folder: where to write; it becomes `options.out`.
         started: `time.monotonic()` when the work began.
         address: of the MLflow store, None for none.
 
@@ -69,7 +69,7 @@ def process(
     Raises:
         RolloutError: nerfstudio cannot use the rollout.
     """
-    config = _configuration(options, rollout, (folder / _OUTPUTS).resolve())
+    config = _configuration(options, rollout, folder.resolve() / _OUTPUTS)
     # Of nerfstudio's many lines none is for the screen; bars and warnings go to the other stream.
     with contextlib.redirect_stdout(io.StringIO()):
         trainer = _set_up(config, keep_checkpoint=options.keep_checkpoint)
@@ -180,14 +180,14 @@ def _score(pipeline: Any, folder: Path, pictures: tuple[int, ...]) -> list[tuple
         if view.index in pictures:
             (folder / "pictures").mkdir(exist_ok=True)
             for kind, picture in (("truth", view.truth), ("render", view.render)):
-                write_rgb((folder / "pictures") / f"{kind}_{view.index:05d}.png", to_8_bit(picture))
+                write_rgb(folder / "pictures" / f"{kind}_{view.index:05d}.png", to_8_bit(picture))
     return views
 
 
 def _keep(config: Any, folder: Path, final: Path) -> str:
     """Write `config.yml` as it is to be read where the folder goes; gives its path within the folder."""
     path = config.get_base_dir() / "config.yml"
-    config.output_dir = (final / _OUTPUTS).resolve()
+    config.output_dir = final.resolve() / _OUTPUTS
     path.write_text(yaml.dump(config), encoding="utf-8")
     return str(path.relative_to(folder.resolve()))
 
