@@ -22,7 +22,6 @@ LIGHT = (
     "poses",
     "ranges",
     "rollout.format",
-    "rollout.images",
     "task.rewards",
     "task.trajectory",
 )

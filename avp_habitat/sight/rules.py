@@ -47,9 +47,8 @@ def in_image(right, up, ahead, camera):
 @njit(cache=True)
 def in_view(pose, point, camera, max_range):
     """Whether a point lies inside the image and within range: distance to the camera, not planar depth."""
-    right, up, ahead = in_camera(pose, point)
-    in_range = right * right + up * up + ahead * ahead <= max_range * max_range
-    return ahead > 0 and in_range and in_image(right, up, ahead, camera)
+    x, y, z = point[0] - pose[0, 3], point[1] - pose[1, 3], point[2] - pose[2, 3]
+    return in_image(*in_camera(pose, point), camera) and np.sqrt(x * x + y * y + z * z) <= max_range
 
 
 @njit(cache=True)
