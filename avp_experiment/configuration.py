@@ -150,9 +150,9 @@ class Configuration:
     scenes: tuple[Scene, ...]
     """Of training first, then unseen ones."""
     methods: tuple[Method, ...]
-    simulator: str = "raycast"
     metrics: tuple[str, ...] = ()
-    """Further ones, of episodes and rollouts."""
+    """Further ones, of episodes and rollouts: `module:function` or what another distribution registers."""
+    simulator: str = "raycast"
     up: str | None = None
     """Axis of mesh files that points up; the scenes' digests cover it."""
 
@@ -174,6 +174,7 @@ class Configuration:
         width, height = values.pop("size")
         values |= {name: list(values[name]) for name in ("prefixes", "heldout_pictures")}
         values |= {"rooms": list(self.rooms), "width": width, "height": height}
+        values |= {"metrics": list(self.metrics)} if self.metrics else {}
         scenes = [{"name": scene.name, "sha256": scene.sha256, "role": scene.role} for scene in self.scenes]
         return {"preset": self.preset_name, **values, "simulator": self.simulator, "scenes": scenes}
 

@@ -3,7 +3,7 @@
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -122,8 +122,8 @@ def _report(
         return
     env = runners[0].env
     about = _about(env, options, complete=complete)
-    print(f"{table(results)}\n\n{LEGEND}\n")
-    write_report(out, results, about)
+    print(f"{table(results, options.metrics)}\n\n{LEGEND}\n")
+    write_report(out, results, about, options.metrics)
     if not complete:
         print(f"interrupted after {sum(map(len, done.values()))} episodes, which are kept")
     print(f"report:  {out}")
@@ -134,12 +134,14 @@ def _report(
 
     firsts = {name: episodes[0].trajectory for name, episodes in done.items() if episodes}
     pictures = {name: draw_trajectory(env.area, first) for name, first in firsts.items() if first is not None}
-    run, experiment, store = track_evaluation(results, about, out, experiment=options.experiment, pictures=pictures)
+    run, experiment, store = track_evaluation(
+        results, about, out, experiment=options.experiment, pictures=pictures, metrics=options.metrics
+    )
     print(f"MLflow:  run {run} in experiment {experiment!r} at {store}")
 
 
 def _about(env: Any, options: Evaluate, *, complete: bool) -> dict[str, Any]:
-    settings = asdict(env.settings)
+    settings = env.settings.facts()
     del settings["observation"]  # Each policy has its own.
     return {
         "command": shlex.join(["python", "-m", "avp_sb3.evaluate", *sys.argv[1:]]),

@@ -106,15 +106,15 @@ class SceneDataset:
                 for file in self._files(pattern, f"{self._where}{key}.paths.{kind}", wanted):
                     yield Entry(file, self.folder / file)
 
-    def _files(self, pattern: Any, told_by: str, ending: str) -> list[str]:
+    def _files(self, pattern: Any, where: str, ending: str) -> list[str]:
         """Paths relative to the dataset's folder of what a pattern matches, and of what lies in matching folders."""
         if not isinstance(pattern, str) or not pattern or "\0" in pattern:
-            raise SceneError(f"{told_by}: expected a path, got {shown(pattern)}")
+            raise SceneError(f"{where}: expected a path, got {shown(pattern)}")
         if os.path.isabs(pattern) or os.path.normpath(pattern).split(os.sep)[0] == os.pardir:
-            raise SceneError(f"{told_by}: {pattern!r} lies outside of {self.folder}, the folder of its data")
+            raise SceneError(f"{where}: {pattern!r} lies outside of {self.folder}, the folder of its data")
         found = []
         for match in sorted(glob.glob(pattern, root_dir=self.folder)):
-            path = inside(self.folder / match, self.folder, told_by, match)
+            path = inside(self.folder / match, self.folder, where, match)
             names = [f"{match.rstrip('/')}/{name}" for name in sorted(os.listdir(path))] if path.is_dir() else [match]
             found += [os.path.normpath(name) for name in names if name.endswith(ending)]
         return found
@@ -138,12 +138,12 @@ class SceneDataset:
         else:
             raise SceneError(f"{self.path}: {where}: expected original_file or template_handle")
 
-    def _stage_of(self, handle: str, told_by: str) -> Entry:
+    def _stage_of(self, handle: str, where: str) -> Entry:
         for matches in _matches(handle, self.stages):
             return matches[0]
         near = difflib.get_close_matches(handle, [entry.words for entry in self.stages], n=1, cutoff=0.5)
         hint = f"; did you mean {near[0]}?" if near else ""
-        raise SceneError(f"{told_by}: {self.path.name} has no stage {handle!r}{hint}")
+        raise SceneError(f"{where}: {self.path.name} has no stage {handle!r}{hint}")
 
     def _stage(self, entry: Entry) -> SceneLocation:
         default = member(self._stages, "default_attributes", {}, f"{self._where}stages.")

@@ -2,10 +2,8 @@
 
 import io
 import json
-import os
 import struct
 import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,6 +14,7 @@ from tyro.conf import Positional, arg
 
 from avp_habitat import command
 from avp_habitat.errors import SceneError, UsageError
+from avp_habitat.files import atomic_file
 from avp_habitat.scenes.loader import load_scene
 from avp_habitat.scenes.location import HELP, UP_HELP
 from avp_habitat.scenes.mesh import TexturedMesh
@@ -39,15 +38,10 @@ def export_glb(mesh: TexturedMesh, path: Path) -> None:
     """
     if path.suffix.lower() != ".glb":
         raise UsageError(f"{path}: expected a name that ends in .glb")
-    if path.exists() or path.is_symlink():
-        raise UsageError(f"{path}: exists already; remove it or choose another name")
-    try:
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-            made = Path(folder) / path.name
-            made.write_bytes(_Glb(mesh).encoded())
-            os.replace(made, path)
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be written: {error.strerror}") from error
+    if not path.parent.is_dir():
+        raise SceneError(f"{path}: cannot be written: there is no folder {path.parent}")
+    with atomic_file(path, replace=False, failure=SceneError) as made:
+        made.write_bytes(_Glb(mesh).encoded())
 
 
 class _Glb:

@@ -80,7 +80,7 @@ def locate(spec: str | Path, *, up: str | None = None) -> SceneLocation:
     if up is None:
         return found
     axes = {"y": Y_UP, "z": Z_UP}[up]
-    return replace(found, up=axes[0], front=axes[1], told_up=up)
+    return replace(found, up=axes[0], front=axes[1], chosen_up=up)
 
 
 def _seed(spec: str) -> int:

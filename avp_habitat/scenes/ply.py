@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles, decode_picture
-from avp_habitat.scenes.mesh import TexturedMesh, say_once
-from avp_habitat.scenes.polygons import triangulate
+from avp_habitat.scenes.mesh import TexturedMesh, triangulate, warn_once
 
 _CODES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _CODES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
@@ -232,7 +231,7 @@ def _mesh(files: SceneFiles, tables: dict[str, _Columns], pictures: list[str]) -
         uv = next((found for names in _COORDINATES if (found := _together(vertex, names)) is not None), None)
     textures = [decode_picture(files.read(name), f"{files.path}: {name}") for name in pictures]
     if colours is None and not (textures and uv is not None):
-        _say_what_is_lost(files, [*vertex, *face], pictures)
+        _warn_of_unread_colours(files, [*vertex, *face], pictures)
     if uv is None:
         textures = []
     return TexturedMesh(
@@ -280,10 +279,10 @@ def _texture_index(face: _Columns, faces: NDArray[np.int64], textures: int) -> N
     return np.where((named >= 0) & (named < textures), named, -1).astype(np.int32)
 
 
-def _say_what_is_lost(files: SceneFiles, properties: list[str], pictures: list[str]) -> None:
+def _warn_of_unread_colours(files: SceneFiles, properties: list[str], pictures: list[str]) -> None:
     names = [name for name in properties if _COLOUR_LIKE.search(name)]
     if names:
         known = "colours are read from " + ", ".join("/".join(each) for each in _COLOURS)
-        say_once(str(files.path), f"is shown white: its {', '.join(names)} are not followed ({known})")
+        warn_once(str(files.path), f"is shown white: its {', '.join(names)} are not followed ({known})")
     elif pictures:
-        say_once(str(files.path), f"is shown white: it names {', '.join(pictures)}, but has no texture coordinates")
+        warn_once(str(files.path), f"is shown white: it names {', '.join(pictures)}, but has no texture coordinates")

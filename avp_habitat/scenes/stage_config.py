@@ -68,7 +68,7 @@ class SceneLocation:
     """Unit vector in the asset's coordinates that points up."""
     front: Vector = Y_UP[1]
     """Unit vector in the asset's coordinates, at right angles to `up`, that becomes the world's -Z."""
-    told_up: str | None = None
+    chosen_up: str | None = None
     """The axis that the user said points up, None for what the file or its config says."""
     dataset: Path | None = None
     """The scene dataset config that the scene belongs to, None for one that was named without it."""
@@ -167,14 +167,14 @@ def expect_neutral(layers: Sequence[Layer], key: str, *neutral: Any) -> None:
     )
 
 
-def inside(target: Path, root: Path, told_by: str, value: str) -> Path:
+def inside(target: Path, root: Path, where: str, value: str) -> Path:
     """The same path without `..`; SceneError where it leaves the data set's folder.
 
     What counts is the path as it is written: links may lead anywhere.
     """
     # No file system takes the null character, and asking about one is an error of its own.
     if "\0" in value or not Path(os.path.abspath(target)).is_relative_to(os.path.abspath(root)):
-        raise SceneError(f"{told_by}: {value!r} lies outside of {root}, the folder of its data")
+        raise SceneError(f"{where}: {value!r} lies outside of {root}, the folder of its data")
     return Path(os.path.normpath(target))
 
 

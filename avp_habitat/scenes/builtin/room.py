@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from avp_habitat.errors import UsageError
 from avp_habitat.scenes.builtin.furnish import Placed, furnish
@@ -99,7 +100,7 @@ class _Voxels:
         for surface in surfaces:
             index = self._index(_samples(surface))
             filled[index[:, 0], index[:, 1], index[:, 2]] = 1
-        self.soft = {reach: _blurred(filled, reach) for reach in (1, 2, 4, 7)}
+        self.soft = {reach: uniform_filter(filled, 2 * reach + 1, mode="nearest") for reach in (1, 2, 4, 7)}
 
     def _index(self, points: Float) -> NDArray[np.int64]:
         index = np.floor((points - self._origin) / _VOXEL_M).astype(np.int64)
@@ -134,18 +135,6 @@ def _samples(surface: Surface) -> Float:
     corners = surface.vertices[surface.triangles]
     weights = np.array([[i, j, 4 - i - j] for i in range(5) for j in range(5 - i)]) / 4
     return np.einsum("kc,tcd->tkd", weights, corners).reshape(-1, 3)
-
-
-def _blurred(filled: NDArray[np.float32], reach: int) -> NDArray[np.float32]:
-    """Mean over cubes of 2 reach + 1 voxels."""
-    out = filled
-    for axis in range(3):
-        padded = np.pad(out, [(reach + 1, reach) if a == axis else (0, 0) for a in range(3)], mode="edge")
-        total = np.cumsum(padded, axis=axis, dtype=np.float64)
-        upper = np.take(total, np.arange(2 * reach + 1, total.shape[axis]), axis=axis)
-        lower = np.take(total, np.arange(0, total.shape[axis] - 2 * reach - 1), axis=axis)
-        out = ((upper - lower) / (2 * reach + 1)).astype(np.float32)
-    return out
 
 
 def _open_sky(voxels: _Voxels, points: Float, normals: Float) -> NDArray[np.float32]:
