@@ -166,7 +166,7 @@ class NewRun:
 def start_run(address: str, new: NewRun, *, offline: bool | None = None, **options: Any) -> TrackedRun:
     """Begin a run; with `offline` although the store does not answer (None: as `AVP_MLFLOW_OFFLINE` says).
 
-    The options are those of `Sender`, also below.
+    Options are those of `Sender`, as for the other ways to open a run.
 
     Raises:
         TrackingError: the store cannot be reached, or refuses.
