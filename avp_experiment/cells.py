@@ -1,17 +1,31 @@
-"""The experiment's matrix: every training, rollout and reconstruction as a command line with what it needs first."""
+"""The experiment's cells: every training, rollout and reconstruction as a command line, and what is kept of it."""
 
+import base64
+import csv
+import json
+import os
 import shlex
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from avp_experiment.configuration import Configuration, Method, Scene
+import numpy as np
+
+from avp_experiment.configuration import TRAIN as TRAIN_SCENE
+from avp_experiment.configuration import Configuration, Method, Scene, scene_slug
+from avp_habitat.errors import AVPError
+from avp_habitat.task.rewards import find_reward, needs_surface
 
 TRAIN, COLLECT, RECONSTRUCT = "train", "collect", "reconstruct"
-KINDS = (TRAIN, COLLECT, RECONSTRUCT)
-START_SEEDS = 1000
+_MADE = {TRAIN: "model.zip", COLLECT: "rollout", RECONSTRUCT: "reconstruction"}
+_START_SEEDS = 1000
 """Seed of the first start of seed 0, and from one start of a seed to its next: more starts leave those before them."""
-SURFACE_OBSERVATION = {"map": "surface_map"}
-"""What a policy that learns from surfaces observes instead."""
+_SURFACE_OBSERVATION = {"map": "surface_map"}
+"""What a policy whose reward needs the surface observes instead."""
+_CURVES = ("avp/cpv", "avp/coverage", "avp/views", "rollout/ep_rew_mean")
+"""Metrics of a training whose course is kept, as at most `_POINTS` points."""
+_POINTS = 400
 
 
 @dataclass(frozen=True)
@@ -19,15 +33,12 @@ class Cell:
     """One piece of the experiment, done by one command."""
 
     kind: str
-    """One of `KINDS`."""
+    """`TRAIN`, `COLLECT` or `RECONSTRUCT`."""
     name: str
-    """Of its folder, unique within its kind."""
+    """Unique within its kind."""
     words: tuple[str, ...]
-    """The command line, which works alone too."""
-    out: str
-    """What the command makes, within the cell's folder."""
+    """The command line, `python -m MODULE …`, which works alone too."""
     method: Method
-    """That takes the views."""
     seed: int
     """Of the training, and of the starts."""
     scene: Scene | None = None
@@ -37,9 +48,6 @@ class Cell:
     frames: int | None = None
     """A reconstruction from the first so many frames; None from all."""
     needs: "Cell | None" = None
-    """What must be done before."""
-    resumes: bool = False
-    """Whether the command can go on with what an interruption left."""
 
     @property
     def key(self) -> str:
@@ -57,94 +65,158 @@ class Cell:
 
     def output(self, root: Path) -> Path:
         """What its command makes."""
-        return self.folder(root) / self.out
+        return self.folder(root) / _MADE[self.kind]
 
 
 def plan(configuration: Configuration, root: Path, *, tracking: str) -> list[Cell]:
-    """All cells; each stands after the one that it needs.
-
-    Args:
-        configuration: of the experiment.
-        root: its folder.
-        tracking: MLflow experiment of the trainings.
-    """
+    """All cells, each after the one that it needs; trainings are logged to the MLflow experiment `tracking`."""
+    planner = _Planner(configuration, root, tracking)
     cells: list[Cell] = []
-    for seed in range(configuration.seeds):
+    for seed in range(configuration.preset.seeds):
         for method in configuration.methods:
-            training = _training(configuration, root, method, seed, tracking) if method.learned else None
+            training = planner.training(method, seed) if method.learned else None
             cells += [training] if training else []
             for scene in configuration.scenes:
-                cells += _episodes(configuration, root, method, seed, scene, training)
+                for start in range(configuration.preset.starts):
+                    rollout = planner.rollout(method, seed, scene, start, training)
+                    prefixes = (None, *configuration.preset.prefixes)
+                    cells += [rollout, *(planner.reconstruction(rollout, frames) for frames in prefixes)]
     # Trainings first, then what is whole: an experiment that is interrupted late lacks only curves.
-    return sorted(cells, key=lambda cell: (KINDS.index(cell.kind), cell.frames is not None))
+    return sorted(cells, key=lambda cell: (list(_MADE).index(cell.kind), cell.frames is not None))
 
 
-def _training(configuration: Configuration, root: Path, method: Method, seed: int, tracking: str) -> Cell:
-    preset = configuration.preset
-    scenes = [scene.spec for scene in configuration.scenes if scene.role == "train"]
-    observation = preset.observation
-    if method.reward == "surface":
-        observation = SURFACE_OBSERVATION.get(observation, observation)
-    name = f"{method.name}-{seed}"
-    model = root / "cells" / TRAIN / name / "model.zip"
-    words = ["python", "-m", "avp_sb3.train", "--scene", *(configuration.rooms if method.rooms else scenes)]
-    words += ["--reward", method.reward, "--observation", observation, "--seed", str(seed)]
-    words += ["--steps", str(preset.steps_rooms if method.rooms else preset.steps)]
-    words += [*configuration.simulator_options, "--out", str(model)]
-    words += ["--experiment", tracking, "--run-name", f"{method.name} (seed {seed})"]
-    return Cell(TRAIN, name, tuple(words), model.name, method, seed, resumes=True)
+@dataclass(frozen=True)
+class _Planner:
+    """Makes the cells of one experiment."""
+
+    configuration: Configuration
+    root: Path
+    tracking: str
+
+    def training(self, method: Method, seed: int) -> Cell:
+        configuration, preset = self.configuration, self.configuration.preset
+        observation = preset.observation
+        if needs_surface(find_reward(method.reward)):
+            observation = _SURFACE_OBSERVATION.get(observation, observation)
+        scenes = [scene.spec for scene in configuration.scenes if scene.role == TRAIN_SCENE]
+        name = f"{method.name}-{seed}"
+        words = ["python", "-m", "avp_sb3.train", "--scene", *(configuration.rooms if method.in_rooms else scenes)]
+        words += ["--reward", method.reward, "--observation", observation, "--seed", str(seed)]
+        words += ["--steps", str(preset.steps_rooms if method.in_rooms else preset.steps)]
+        words += [*configuration.simulator_options, "--out", self._out(TRAIN, name)]
+        words += ["--experiment", self.tracking, "--run-name", f"{method.name} (seed {seed})"]
+        return Cell(TRAIN, name, tuple(words), method, seed)
+
+    def rollout(self, method: Method, seed: int, scene: Scene, start: int, training: Cell | None) -> Cell:
+        preset, (width, height) = self.configuration.preset, self.configuration.preset.size
+        policy = (
+            ["--policy", str(training.output(self.root)), "--stochastic"] if training else ["--policy", method.spec]
+        )
+        name = f"{method.name}-{scene_slug(scene.name)}-{seed}-{start}"
+        words = ["python", "-m", "avp_habitat.collect", "--scene", scene.spec, *policy, "--reward", method.reward]
+        # Every method starts at the same places.
+        words += ["--seed", str(_START_SEEDS * (1 + start) + seed), "--budget", str(preset.budget)]
+        words += ["--width", str(width), "--height", str(height), *self.configuration.simulator_options]
+        words += ["--metrics", *self.configuration.metrics] if self.configuration.metrics else []
+        words += ["--out", self._out(COLLECT, name), "--mlflow", "off"]
+        return Cell(COLLECT, name, tuple(words), method, seed, scene, start, needs=training)
+
+    def reconstruction(self, rollout: Cell, frames: int | None) -> Cell:
+        preset, of = self.configuration.preset, rollout
+        name = of.name if frames is None else f"{of.name}-first_{frames}"
+        words = ["python", "-m", "avp_nerfstudio.reconstruct", str(of.output(self.root))]
+        words += ["--out", self._out(RECONSTRUCT, name)]
+        words += ["--method", preset.reconstruction, "--iterations", str(preset.iterations)]
+        words += ["--frames", str(frames)] if frames is not None else []
+        if frames is None and of.seed == 0 and of.start == 0:
+            words += ["--pictures", *map(str, preset.heldout_pictures)]
+        return Cell(RECONSTRUCT, name, tuple(words), of.method, of.seed, of.scene, of.start, frames, of)
+
+    def _out(self, kind: str, name: str) -> str:
+        return str(self.root / "cells" / kind / name / _MADE[kind])
 
 
-def _episodes(
-    configuration: Configuration, root: Path, method: Method, seed: int, scene: Scene, training: Cell | None
-) -> list[Cell]:
-    cells = []
-    for start in range(configuration.preset.starts):
-        rollout = _rollout(configuration, root, method, seed, scene, start, training)
-        cells += [rollout, _reconstruction(configuration, root, rollout, None)]
-        cells += [_reconstruction(configuration, root, rollout, k) for k in configuration.preset.prefixes]
-    return cells
+def facts_of(cell: Cell, root: Path) -> dict[str, Any]:
+    """What is kept of a cell whose command has succeeded.
+
+    Raises:
+        AVPError: what the command made cannot be used.
+    """
+    facts = {TRAIN: _of_training, COLLECT: _of_rollout, RECONSTRUCT: _of_reconstruction}
+    return facts[cell.kind](cell.output(root))
 
 
-def _rollout(
-    configuration: Configuration,
-    root: Path,
-    method: Method,
-    seed: int,
-    scene: Scene,
-    start: int,
-    training: Cell | None,
-) -> Cell:
-    preset, (width, height) = configuration.preset, configuration.preset.size
-    name = f"{method.name}-{scene.slug}-{seed}-{start}"
-    out = root / "cells" / COLLECT / name / "rollout"
-    policy = ["--policy", str(training.output(root)), "--stochastic"] if training else ["--policy", method.name]
-    words = ["python", "-m", "avp_habitat.collect", "--scene", scene.spec, *policy, "--reward", method.reward]
-    # Every method starts at the same places.
-    words += ["--seed", str(START_SEEDS * (1 + start) + seed), "--budget", str(preset.budget)]
-    words += ["--width", str(width), "--height", str(height), *configuration.simulator_options]
-    words += ["--out", str(out), "--mlflow", "off"]
-    return Cell(COLLECT, name, tuple(words), out.name, method, seed, scene, start, needs=training)
+def _of_training(path: Path) -> dict[str, Any]:
+    from mlflow import MlflowClient
+
+    from avp_habitat.policies.registry import load_model
+
+    model = load_model(path)
+    run_id = getattr(model, "avp_mlflow_run_id", None)
+    curves = _curves(MlflowClient(os.environ["MLFLOW_TRACKING_URI"]), run_id) if run_id else {}
+    return {"steps": model.num_timesteps, "run_id": run_id, "curves": curves}
 
 
-def _reconstruction(configuration: Configuration, root: Path, rollout: Cell, frames: int | None) -> Cell:
-    preset = configuration.preset
-    name = rollout.name if frames is None else f"{rollout.name}-first_{frames}"
-    out = root / "cells" / RECONSTRUCT / name / "reconstruction"
-    words = ["python", "-m", "avp_nerfstudio.reconstruct", str(rollout.output(root)), "--out", str(out)]
-    words += ["--method", preset.reconstruction, "--iterations", str(preset.iterations)]
-    words += ["--frames", str(frames)] if frames is not None else []
-    if frames is None and rollout.seed == 0 and rollout.start == 0:
-        words += ["--pictures", *map(str, preset.heldout_pictures)]
-    return Cell(
-        RECONSTRUCT,
-        name,
-        tuple(words),
-        out.name,
-        rollout.method,
-        rollout.seed,
-        rollout.scene,
-        rollout.start,
-        frames,
-        rollout,
-    )
+def _curves(client: Any, run_id: str) -> dict[str, list[list[float]]]:
+    """`[step, value]` points by metric; empty where MLflow has not got the run yet."""
+    from mlflow.exceptions import MlflowException
+
+    curves = {}
+    for metric in _CURVES:
+        try:
+            found = {point.step: point.value for point in client.get_metric_history(run_id, metric)}
+        except MlflowException:
+            continue
+        steps = sorted(found)
+        kept = np.unique(np.linspace(0, len(steps) - 1, min(len(steps), _POINTS)).astype(int)) if steps else []
+        curves[metric] = [[steps[i], round(found[steps[i]], 6)] for i in kept]
+    return curves
+
+
+def _of_rollout(folder: Path) -> dict[str, Any]:
+    """The episode's figures, and coverage and visibility after each view."""
+    from avp_habitat.rollout.format import read_rollout
+    from avp_habitat.rollout.seen import visibility_of
+
+    rollout = read_rollout(folder)
+    seen = visibility_of(rollout.frames, rollout.heldout, rollout.intrinsics)
+    return {
+        "metrics": rollout.meta["metrics"] | seen.figures(),
+        "coverage_curve": [round(float(row["coverage"]), 6) for row in _steps(folder)],
+        "visibility_curve": [round(float(share), 6) for share in seen.curve()],
+    }
+
+
+def _steps(folder: Path) -> list[dict[str, str]]:
+    with (folder / "steps.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def floor_map(folder: Path) -> dict[str, Any] | None:
+    """The map of a rollout as `results.json` keeps it, with `[x, z, yaw]` after each step in metres and radians.
+
+    Returns:
+        None for a rollout that was written without its floor.
+    """
+    from avp_habitat.rollout.format import read_rollout
+    from avp_habitat.rollout.images import read_numbers
+
+    floor = read_rollout(folder).floor
+    if floor is None:
+        return None
+    numbers = read_numbers(floor.picture).astype("<u2")
+    return {
+        "cell_m": floor.cell_m,
+        "origin_m": list(floor.origin_m),
+        "shape": list(floor.shape),
+        "floor": base64.b64encode(zlib.compress(numbers.tobytes(), 9)).decode("ascii"),
+        "path": [[round(float(row[name]), 4) for name in ("x_m", "z_m", "yaw_rad")] for row in _steps(folder)],
+    }
+
+
+def _of_reconstruction(folder: Path) -> dict[str, Any]:
+    path = folder / "scores.json"
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise AVPError(f"{path}: expected the scores of a reconstruction: {error}") from None

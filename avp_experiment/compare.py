@@ -1,187 +1,151 @@
 """`python -m avp_experiment.compare`: train, collect, reconstruct and compare; `mlflow run . -e compare`."""
 
-import argparse
 import os
 import shlex
-import shutil
 import sys
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Annotated
 
-from avp_experiment.cells import Cell, plan
-from avp_experiment.configuration import DEFAULT, METHODS, Configuration, chosen_methods, keep, read_scenes
-from avp_experiment.presets import PRESETS, preset_named
-from avp_experiment.runner import PRELOAD, Runner, default_jobs
-from avp_experiment.store import Store, bytes_needed
+from tyro.conf import arg
+
+from avp_experiment.cells import plan
+from avp_experiment.configuration import DEFAULT, PRESETS, ROOMS, Configuration, chosen_methods, read_scenes
+from avp_experiment.folder import open_folder
+from avp_experiment.runner import PRELOAD, Runner, environment
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
-from avp_habitat.rollout.capture import VIEWS
-from avp_habitat.simulators.registry import ONE_PER_PROCESS, SIMULATOR_NAMES, SimulatorChoice, add_up_option
-
-if TYPE_CHECKING:
-    from avp_experiment.tracking import Parent
+from avp_habitat.metrics import METRICS_HELP, find_metrics
+from avp_habitat.scenes.location import UP_HELP
+from avp_habitat.simulators.registry import SIMULATORS, SimulatorChoice
 
 AUTO = "auto"
 NONE = "none"
+_METHODS = f"with commas between: policies, rewards, rewards with {ROOMS}, module:object; auto: {', '.join(DEFAULT)}"
 
 
 @dataclass(frozen=True)
-class Options:
-    """What was asked for."""
+class Compare:
+    """Train every reward, let all methods take views from the same starts, reconstruct, score and compare.
 
-    configuration: Configuration
-    """Of the experiment."""
-    out: Path
-    """Its folder."""
-    jobs: int
-    """Cells at a time."""
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m avp_experiment.compare", description=__doc__)
-    add = parser.add_argument
-    add("--scene", default="builtin:0", help="scenes to train in, with commas between (default: %(default)s)")
-    add("--unseen", default="builtin:1", help="scenes never trained in, with commas between, or none (%(default)s)")
-    add("--preset", default="cpu", help=f"{', '.join(PRESETS)} (default: %(default)s)")
-    add("--seeds", default=AUTO, help="trainings of each reward; auto: the preset's (default: %(default)s)")
-    add("--starts", default=AUTO, help="episodes of each method, scene and seed; auto: the preset's")
-    add("--methods", default=AUTO, help=f"with commas between, of {', '.join(METHODS)}; auto: {', '.join(DEFAULT)}")
-    add("--simulator", default="raycast", help=f"{', '.join(SIMULATOR_NAMES)} (default: %(default)s)")
-    add_up_option(parser)
-    add(
-        "--out",
-        default=AUTO,
-        help="the experiment's folder, also of one to go on with (default: runs/experiment-PRESET)",
-    )
-    add("--jobs", default=AUTO, help="cells at a time; auto: one per core (default: %(default)s)")
-    return parser
-
-
-def read_options(argv: Sequence[str]) -> Options:
-    """Everything that can be known to be wrong is refused here, before anything is written.
-
-    Raises:
-        UsageError: an option cannot be right.
-        AVPError: a scene cannot be used.
+    Writes tables, figures and the answers to the paper's questions. What is done is not done again.
     """
-    given = _parser().parse_args(argv)
-    preset = preset_named(given.preset)
-    methods = chosen_methods(DEFAULT if given.methods == AUTO else _split(given.methods))
-    seeds = preset.seeds if given.seeds == AUTO else _number("seeds", given.seeds)
-    if given.starts != AUTO:
-        preset = replace(preset, starts=_number("starts", given.starts))
-    jobs = default_jobs() if given.jobs == AUTO else _number("jobs", given.jobs)
-    if given.simulator not in SIMULATOR_NAMES:
-        raise unknown_name("simulator", given.simulator, SIMULATOR_NAMES)
-    unseen = [] if given.unseen == NONE else _split(given.unseen)
-    scenes = read_scenes(_split(given.scene), unseen, SimulatorChoice(given.simulator, up=given.up))
-    out = Path("runs") / f"experiment-{given.preset}" if given.out == AUTO else Path(given.out)
-    configuration = Configuration(given.preset, preset, seeds, scenes, methods, given.simulator, given.up)
-    return Options(configuration, out, jobs)
+
+    scene: str = "builtin:0"
+    """Scenes to train in, with commas between."""
+    unseen: str = "builtin:1"
+    """Scenes never trained in, with commas between, or none."""
+    preset: Annotated[str, arg(help=", ".join(PRESETS))] = "cpu"
+    seeds: str = AUTO
+    """Trainings of each reward; auto: the preset's number."""
+    starts: str = AUTO
+    """Episodes of each method, scene and seed; auto: the preset's number."""
+    methods: Annotated[str, arg(help=_METHODS)] = AUTO
+    metrics: Annotated[str, arg(help=f"with commas between, or none: {METRICS_HELP}")] = NONE
+    simulator: Annotated[str, arg(help=f"{', '.join(SIMULATORS)} or MODULE:FACTORY")] = "raycast"
+    up: Annotated[str | None, arg(help=UP_HELP)] = None
+    out: str = AUTO
+    """The experiment's folder, also of one to go on with; auto: runs/experiment-PRESET."""
+    jobs: str = AUTO
+    """Cells at a time; auto: one per core."""
+
+    def configuration(self) -> Configuration:
+        """Everything that can be known to be wrong is refused here, before anything is written.
+
+        Raises:
+            UsageError: an option cannot be right.
+            AVPError: a scene cannot be used.
+        """
+        if self.preset not in PRESETS:
+            raise unknown_name("preset", self.preset, PRESETS)
+        methods = chosen_methods(DEFAULT if self.methods == AUTO else _split(self.methods))
+        preset = PRESETS[self.preset]
+        preset = replace(preset, seeds=_number("seeds", self.seeds, preset.seeds))
+        preset = replace(preset, starts=_number("starts", self.starts, preset.starts))
+        choice = SimulatorChoice(self.simulator, up=self.up)
+        metrics = _split(self.metrics)
+        find_metrics(metrics)
+        scenes = read_scenes(_split(self.scene), _split(self.unseen), choice)
+        return Configuration(self.preset, preset, scenes, methods, tuple(metrics), self.simulator, self.up)
+
+    @property
+    def line(self) -> str:
+        """The command line as a user types it."""
+        given = {field.name: (getattr(self, field.name), field.default) for field in fields(self)}
+        chosen = {name: str(value) for name, (value, default) in given.items() if value != default}
+        if os.environ.get("MLFLOW_RUN_ID"):
+            options = [f"-P {name}={shlex.quote(value)}" for name, value in chosen.items()]
+            return " ".join(["mlflow run . -e compare --env-manager local", *options])
+        options = [word for name, value in chosen.items() for word in (f"--{name}", value)]
+        return shlex.join(["python", "-m", "avp_experiment.compare", *options])
 
 
 def _split(text: str) -> list[str]:
-    return [part.strip() for part in text.split(",") if part.strip()]
+    return [part.strip() for part in text.split(",") if part.strip() not in ("", NONE)]
 
 
-def _number(option: str, text: str) -> int:
+def _number(option: str, text: str, auto: int) -> int:
+    if text == AUTO:
+        return auto
     if not text.isdecimal() or int(text) < 1:
         raise UsageError(f"{option}: expected a whole number from 1, or {AUTO}, got {text!r}")
     return int(text)
 
 
-def check_disk(options: Options, store: Store, cells: Sequence[Cell]) -> None:
-    """Refuse to begin what the disk cannot hold.
-
-    Raises:
-        AVPError: there is too little room.
-    """
-    preset, (width, height) = options.configuration.preset, options.configuration.preset.size
-    left = [cell for cell in cells if not store.is_done(cell)]
-    needed = bytes_needed(left, width=width, height=height, budget=preset.budget, heldout=VIEWS)
-    free = shutil.disk_usage(options.out).free
-    if needed > free:
-        raise AVPError(
-            f"out: {options.out}: the {len(left)} cells to do need about {_size(needed)}, and {_size(free)} are free "
-            "there; name a folder on another disk, or a smaller preset, fewer seeds, starts or methods"
-        )
-    print(f"{len(left)} of {len(cells)} cells to do, about {_size(needed)} of disk ({_size(free)} free): {options.out}")
-
-
-def _size(count: int) -> str:
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
-
-
-def run(options: Options, line: str) -> None:
+def compare(configuration: Configuration, out: Path, *, jobs: int, line: str) -> None:
     """Do what is left, then write tables and figures and log them.
 
-    Raises:
-        AVPError: nothing could be done, or some cells failed; the others are done then.
-    """
-    from avp_experiment.execute import environment
-    from avp_experiment.tracking import open_parent, tracking_uri
+    Args:
+        configuration: of the experiment.
+        out: its folder.
+        jobs: cells at a time.
+        line: the command, for the results and for going on after an interruption.
 
-    keep(options.configuration, options.out)
-    store = Store(options.out)
-    with store.alone():
-        check_disk(options, store, plan(options.configuration, options.out, tracking="?"))
-        parent = open_parent(f"compare {options.configuration.preset_name}")
+    Raises:
+        AVPError: the folder cannot be used, or some cells failed; the others are done then.
+    """
+    from avp_experiment.report import write_report
+    from avp_experiment.results import gather
+    from avp_experiment.tracking import log_results, open_parent, tracking_uri
+
+    folder = open_folder(configuration, out)
+    with folder.alone():
+        folder.check_disk(plan(configuration, out, tracking="?"), configuration)
+        parent, experiment = open_parent(f"compare {configuration.preset_name}")
         status = "FAILED"
         try:
-            cells = plan(options.configuration, options.out, tracking=parent.experiment)
-            preload = () if options.configuration.simulator in ONE_PER_PROCESS else PRELOAD
-            runner = Runner(store, options.jobs, environment(tracking_uri()), preload)
+            cells = plan(configuration, out, tracking=experiment)
+            preload = () if SimulatorChoice(configuration.simulator).one_per_process else PRELOAD
+            runner = Runner(folder, jobs, environment(tracking_uri()), preload)
             runner.run(cells)
-            write_report(options, store, cells, line, parent)
+            results = gather(configuration, folder, cells, command=line)
+            write_report(out)
+            log_results(parent, experiment, results, out)
             status = "FINISHED"
         except KeyboardInterrupt:
             status = "KILLED"
-            print(f"\nwhat is done is kept in {options.out}; to go on:  {line}", file=sys.stderr)
+            print(f"\nwhat is done is kept in {out}; to go on:  {line}", file=sys.stderr)
             raise
         finally:
             parent.close(status)
+    print(f"results:      {out}/results.md (tables, figures, claims; from {out}/results.json)")
+    print(f"MLflow run:   {parent.run_id}")
     if runner.failed:
         raise AVPError(
-            f"{len(runner.failed)} of {len(cells)} cells failed (reasons: {options.out}/results.md); "
+            f"{len(runner.failed)} of {len(cells)} cells failed (reasons: {out}/results.md); "
             f"the same command tries them again"
         )
 
 
-def write_report(options: Options, store: Store, cells: Sequence[Cell], line: str, parent: "Parent") -> None:
-    """Gather what was found; tables and figures from it; all of it into MLflow."""
-    from avp_experiment.report import write_report as tables_and_figures
-    from avp_experiment.results import copy_pictures, gather, write
-    from avp_experiment.tracking import log_results
-
-    hours = sum(record["seconds"] for cell in cells if (record := store.record(cell))) / 3600
-    results = gather(options.configuration, store, cells, command=line, hours=hours)
-    copy_pictures(store, cells)
-    write(results, options.out)
-    tables_and_figures(options.out)
-    log_results(parent, results, options.out)
-    print(f"results:      {options.out}/results.md (tables, figures, claims; from {options.out}/results.json)")
-    print(f"MLflow run:   {parent.run.run_id}")
-
-
-def main(argv: Sequence[str]) -> None:
+def main(options: Compare) -> None:
     """Compare."""
     began = time.monotonic()
-    options = read_options(argv)
-    run(options, typed(argv))
+    configuration = options.configuration()
+    out = Path("runs") / f"experiment-{options.preset}" if options.out == AUTO else Path(options.out)
+    jobs = _number("jobs", options.jobs, len(os.sched_getaffinity(0)))
+    compare(configuration, out, jobs=jobs, line=options.line)
     print(f"done in {(time.monotonic() - began) / 60:.1f} min")
-
-
-def typed(argv: Sequence[str]) -> str:
-    """The command line as the user would type it."""
-    if not os.environ.get("MLFLOW_RUN_ID"):
-        return shlex.join(["python", "-m", "avp_experiment.compare", *argv])
-    given = vars(_parser().parse_args(argv))
-    default = vars(_parser().parse_args([]))
-    chosen = [f"-P {name}={shlex.quote(value)}" for name, value in given.items() if value != default[name]]
-    return " ".join(["mlflow run . -e compare --env-manager local", *chosen])
 
 
 if __name__ == "__main__":

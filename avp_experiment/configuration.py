@@ -1,75 +1,125 @@
-"""What an experiment's figures depend on, kept beside them so that a folder never mixes two experiments."""
+"""What an experiment consists of: methods, scenes, and a preset for each kind of machine and purpose."""
 
-import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from avp_experiment.presets import Preset
-from avp_habitat.errors import AVPError, UsageError, unknown_name
-from avp_habitat.policies.registry import POLICY_NAMES
+from avp_habitat import plugins
+from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.policies.registry import POLICIES
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
-from avp_habitat.task.rewards import REWARD_NAMES
+from avp_habitat.task.rewards import REWARDS
 
+TRAIN, UNSEEN = "train", "unseen"
+"""Roles of scenes: policies are trained in the former, never in the latter."""
 ROOMS = "_rooms"
 """A learned method whose name ends so is trained in generated rooms, never in the scenes of the experiment."""
-_WITHOUT_STOP = "coverage"
+_FIRST_ROOM = 100
 
 
 @dataclass(frozen=True)
 class Method:
-    """A way to take views."""
+    """A way to take views: a policy, or what a policy learns from a reward."""
 
-    name: str
-    """In files and tables."""
-    reward: str
-    """What it learns from; of a baseline, which has no use for it, one without a stop."""
-    learned: bool
-    """Whether it is trained."""
-    rooms: bool = False
-    """Whether it is trained in generated rooms."""
+    spec: str
+    """The policy or reward: its name or `module:object`."""
+    learned: bool = False
+    """Whether it is a reward."""
+    in_rooms: bool = False
+    """Whether it is trained in generated rooms, never in the scenes of the experiment."""
+
+    @property
+    def name(self) -> str:
+        """In files and tables."""
+        return self.spec.replace(":", ".") + (ROOMS if self.in_rooms else "")
+
+    @property
+    def reward(self) -> str:
+        """What it learns from; of a baseline, which has no use for it, one without a stop."""
+        return self.spec if self.learned else "coverage"
 
 
-METHODS = {
-    name: Method(name, _WITHOUT_STOP, learned=False) for name in POLICY_NAMES
-} | {
-    reward + suffix: Method(reward + suffix, reward, learned=True, rooms=bool(suffix))
-    for suffix in ("", ROOMS)
-    for reward in REWARD_NAMES
-}  # fmt: skip
-"""By name."""
+def known_methods() -> dict[str, Method]:
+    """By name: policies, rewards, rewards trained in rooms; also those that other distributions register."""
+    rewards = plugins.names("avp.rewards", REWARDS)
+    methods = [Method(name) for name in plugins.names("avp.policies", POLICIES)]
+    methods += [Method(reward, learned=True, in_rooms=rooms) for rooms in (False, True) for reward in rewards]
+    return {method.name: method for method in methods}
+
+
 BASELINES = ("heuristic", "random", "frontier", "greedy", "oracle", "survey")
 """What learned policies are compared with by default; the last two plan with full knowledge, for floor and for all
 surfaces."""
-DEFAULT = (*BASELINES, *REWARD_NAMES, f"proposed{ROOMS}", f"surface{ROOMS}")
+DEFAULT = (*BASELINES, *REWARDS, f"proposed{ROOMS}", f"surface{ROOMS}")
 """The baselines, every reward, and the rewards with a learned stop trained over many rooms."""
 
 
-def chosen_methods(names: Iterable[str]) -> tuple[Method, ...]:
-    """The methods of these names, in the order of `METHODS`' tables.
+def chosen_methods(names: Sequence[str]) -> tuple[Method, ...]:
+    """The methods of these names, each once: known ones in their order, then those of the form `module:object`.
+
+    Args:
+        names: known ones, or `module:object` of a class or object with `predict`, or else of a reward; a reward's may
+            end in `_rooms`.
 
     Raises:
         UsageError: no such method, with the nearest name, or none at all.
     """
-    names = list(names)
-    for name in names:
-        if name not in METHODS:
-            raise unknown_name("method", name, METHODS)
     if not names:
         raise UsageError("methods: expected at least one, got none")
-    return tuple(METHODS[name] for name in in_order(names))
+    known = known_methods()
+    for name in names:
+        if ":" not in name and name not in known:
+            raise unknown_name("method", name, known)
+    placed = [_placed(name) for name in dict.fromkeys(names) if ":" in name]
+    return (*(method for name, method in known.items() if name in names), *placed)
 
 
-def in_order(names: Iterable[str]) -> Sequence[str]:
-    """Each name once: baselines first, then rewards, then those trained in rooms."""
-    wanted = set(names)
-    return [name for name in METHODS if name in wanted]
+def _placed(name: str) -> Method:
+    spec = name.removesuffix(ROOMS)
+    learned = not hasattr(plugins.find("avp.policies", spec, POLICIES), "predict")
+    return Method(spec, learned, in_rooms=learned and name != spec)
 
 
-FORMAT = 1
-FILE = "experiment.json"
-_FIRST_ROOM = 100
+@dataclass(frozen=True)
+class Preset:
+    """Everything about an experiment but its scenes, methods and simulator."""
+
+    steps: int
+    """Environment steps of a training in the scenes."""
+    steps_rooms: int
+    """Environment steps of a training in generated rooms."""
+    seeds: int = 3
+    """Trainings of each reward, and places to start from."""
+    starts: int = 1
+    """Episodes of each method, scene and seed."""
+    observation: str = "map"
+    """What the policies observe; `map` becomes what the reward `surface` needs for that reward."""
+    rooms: int = 16
+    """How many generated rooms."""
+    size: tuple[int, int] = (640, 480)
+    """Width and height of the pictures in pixels."""
+    reconstruction: str = "avp-nerfacto"
+    """nerfstudio's method."""
+    iterations: int = 30_000
+    """Of each reconstruction."""
+    prefixes: tuple[int, ...] = (20, 40, 60)
+    """Each episode is also reconstructed from its first so many frames."""
+    budget: int = 80
+    """T: most views of an episode."""
+    heldout_pictures: tuple[int, ...] = (3, 11, 16)
+    """Held-out views whose renders are kept."""
+
+
+PRESETS = {
+    "demo": Preset(300_000, 300_000, seeds=1, rooms=2, size=(192, 144), iterations=1000, prefixes=()),
+    "smoke": Preset(24_576, 24_576, seeds=1, rooms=2, size=(96, 72), iterations=100, prefixes=(40,)),
+    "cpu": Preset(700_000, 700_000, size=(192, 144), iterations=300, prefixes=(20, 40)),
+    "gpu": Preset(1_000_000, 2_000_000, starts=3),
+    "paper": Preset(300_000, 300_000, observation="numbers", reconstruction="nerfacto"),
+}
+"""demo: one good training, no curves (`make demo`). smoke: minutes, to see that everything works. cpu: two to three
+hours on two cores. gpu: the same questions at full size. paper: the paper's observation, steps and reconstruction."""
 
 
 @dataclass(frozen=True)
@@ -81,14 +131,8 @@ class Scene:
     name: str
     """Without folders."""
     sha256: str
-    """Of its content."""
     role: str
-    """`train`: policies are trained in it. `unseen`: they are not."""
-
-    @property
-    def slug(self) -> str:
-        """The name for files."""
-        return scene_slug(self.name)
+    """`TRAIN` or `UNSEEN`."""
 
 
 def scene_slug(name: str) -> str:
@@ -101,17 +145,14 @@ class Configuration:
     """An experiment."""
 
     preset_name: str
-    """Of the preset."""
     preset: Preset
-    """Its values."""
-    seeds: int
-    """Trainings of each reward."""
+    """Its values, some of them perhaps replaced by the user."""
     scenes: tuple[Scene, ...]
     """Of training first, then unseen ones."""
     methods: tuple[Method, ...]
-    """Compared."""
+    metrics: tuple[str, ...] = ()
+    """Further ones, of episodes and rollouts: `module:function` or what another distribution registers."""
     simulator: str = "raycast"
-    """The simulator's name."""
     up: str | None = None
     """Axis of mesh files that points up; the scenes' digests cover it."""
 
@@ -129,11 +170,12 @@ class Configuration:
 
     def as_json(self) -> dict[str, Any]:
         """Scenes, preset and its values as the results state them."""
-        scenes = [{"name": scene.name, "sha256": scene.sha256, "role": scene.role} for scene in self.scenes]
         values = asdict(self.preset)
         width, height = values.pop("size")
         values |= {name: list(values[name]) for name in ("prefixes", "heldout_pictures")}
-        values |= {"rooms": list(self.rooms), "seeds": self.seeds, "width": width, "height": height}
+        values |= {"rooms": list(self.rooms), "width": width, "height": height}
+        values |= {"metrics": list(self.metrics)} if self.metrics else {}
+        scenes = [{"name": scene.name, "sha256": scene.sha256, "role": scene.role} for scene in self.scenes]
         return {"preset": self.preset_name, **values, "simulator": self.simulator, "scenes": scenes}
 
 
@@ -147,75 +189,17 @@ def read_scenes(train: Sequence[str], unseen: Sequence[str], choice: SimulatorCh
     if not train:
         raise UsageError("scene: expected at least one scene of training, got none")
     found: list[Scene] = []
-    for role, specs in (("train", train), ("unseen", unseen)):
+    for role, specs in ((TRAIN, train), (UNSEEN, unseen)):
         for spec in specs:
             opened = open_simulator(choice, spec)
             _ = opened.area
             scene = Scene(spec, opened.scene, opened.scene_digest, role)
             opened.close()
             for other in found:
-                _check_different(scene, other)
+                if scene.sha256 == other.sha256:
+                    same = f"the same scene as {other.spec}, given as {other.role}; expected each scene once"
+                    raise UsageError(f"{spec}: {same}")
+                if scene_slug(scene.name) == scene_slug(other.name):
+                    raise UsageError(f"{spec}: has the same name as {other.spec}; expected scenes of different names")
             found.append(scene)
     return tuple(found)
-
-
-def _check_different(scene: Scene, other: Scene) -> None:
-    if scene.sha256 == other.sha256:
-        raise UsageError(
-            f"{scene.spec}: the same scene as {other.spec}, given as {other.role}; expected each scene once"
-        )
-    if scene.slug == other.slug:
-        raise UsageError(f"{scene.spec}: has the same name as {other.spec}; expected scenes of different names")
-
-
-def keep(configuration: Configuration, folder: Path) -> None:
-    """Write the configuration into the experiment's folder, or hold it against the one that is there.
-
-    Raises:
-        UsageError: the folder holds something else, or an experiment of another configuration.
-        AVPError: nothing can be written there.
-    """
-    path, wanted = folder / FILE, _fixed(configuration.as_json())
-    if path.exists():
-        known = _fixed(_known(path))
-        if different := sorted(name for name in {*wanted, *known} if wanted.get(name) != known.get(name)):
-            raise UsageError(
-                f"out: {folder} holds an experiment of another configuration: "
-                f"{_differences(different, known, wanted)}; name another folder, or remove it"
-            )
-        return
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UsageError(f"out: {folder} is no experiment's folder (it has no {FILE}); expected a new or empty folder")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(".part")
-        temporary.write_text(json.dumps({"format": FORMAT, **wanted}, indent=1) + "\n", encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        raise AVPError(f"out: {folder}: cannot write there: {error.strerror}") from None
-
-
-def _fixed(values: dict[str, Any]) -> dict[str, Any]:
-    """What may not change within a folder; methods and starts may be added."""
-    return {name: value for name, value in values.items() if name != "starts"}
-
-
-def _known(path: Path) -> dict[str, Any]:
-    try:
-        known = json.loads(path.read_text(encoding="utf-8"))
-        version = known.pop("format")
-    except (OSError, ValueError, KeyError, AttributeError) as error:
-        raise AVPError(f"{path}: expected an experiment's configuration, could not read it: {error}") from None
-    if version != FORMAT:
-        raise AVPError(f"{path}: expected format {FORMAT}, found {version!r}")
-    return known
-
-
-def _differences(names: Sequence[str], known: dict[str, Any], wanted: dict[str, Any]) -> str:
-    def short(value: Any) -> str:
-        if isinstance(value, list) and value and isinstance(value[0], dict):
-            return ", ".join(f"{one['name']} ({one['role']})" for one in value)
-        text = str(value)
-        return text if len(text) <= 60 else f"{text[:57]}..."
-
-    return "; ".join(f"{name} {short(known.get(name))} there, {short(wanted.get(name))} asked for" for name in names)

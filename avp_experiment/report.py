@@ -1,30 +1,27 @@
-"""Make every table and figure of an experiment from its results.json, and the page that holds them.
+"""`python -m avp_experiment.report`: every table and figure of an experiment, and the page that holds them."""
 
-Written into the same folder: results.md, claims.md, table2 and table3 (.md and .csv), and the figures (.png). A file
-reading.md beside them, written by hand, becomes a part of the page. What cannot be made is left out; the page says why.
-"""
-
-import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from tyro.conf import Positional
+
 from avp_experiment.claims import claims
-from avp_experiment.figures import (
-    Made,
+from avp_experiment.configuration import TRAIN, UNSEEN
+from avp_experiment.pictures import DEFAULT_MAPS, maps, same_views
+from avp_experiment.plots import (
+    Drawn,
     Missing,
     cpv_while_training,
     psnr_by_views,
     reward_while_training,
     visibility_and_psnr,
 )
-from avp_experiment.look import save
-from avp_experiment.stored import FILE, TRAIN, UNSEEN, Results, read_results
+from avp_experiment.results import FILE, Results, read_results
 from avp_experiment.tables import make_table
-from avp_experiment.top_down import DEFAULT_MAPS, maps, same_views
 from avp_habitat import command
 from avp_habitat.errors import AVPError, unknown_name
 
@@ -33,18 +30,8 @@ _TABLES = {
     "table2": (TRAIN, "Table 2: scenes of training"),
     "table3": (UNSEEN, "Table 3: unseen scenes, no retraining"),
 }
-
-
-@dataclass(frozen=True)
-class _Part:
-    """A piece of the page."""
-
-    title: str
-    """Its heading."""
-    text: str | None
-    """None where it could not be made."""
-    reason: str = ""
-    """Why not."""
+_SETTINGS = ("seeds", "starts", "budget", "observation", "steps", "steps_rooms", "width", "height", "reconstruction",
+             "iterations")  # fmt: skip
 
 
 def write_report(folder: Path, *, shown_maps: Sequence[str] = DEFAULT_MAPS) -> Path:
@@ -58,27 +45,36 @@ def write_report(folder: Path, *, shown_maps: Sequence[str] = DEFAULT_MAPS) -> P
         The page.
 
     Raises:
-        UsageError: no such folder, or a method of figure 5 that the experiment has not got.
+        UsageError: no such folder.
         AVPError: the results are damaged, or the folder cannot be written.
     """
     results = read_results(folder)
+    parts: dict[str, Callable[[], str]] = {
+        title: partial(_table, results, name, role, title) for name, (role, title) in _TABLES.items()
+    }
+    parts |= {
+        title: partial(_figure, results, name, title, draw) for name, (title, draw) in _figures(shown_maps).items()
+    }
+    sections, left_out = [], []
     try:
-        return _write(results, shown_maps)
+        for title, make in parts.items():
+            try:
+                sections.append(f"## {title}\n\n{make()}")
+            except Missing as reason:
+                left_out.append(f"- {title}: {reason}.")
+        said = claims(results)
+        (folder / CLAIMS).write_text(said, encoding="utf-8")
+        reading = folder / READING
+        read = [_below(reading.read_text(encoding="utf-8"))] if reading.is_file() else []
+        end = "\n".join(["## Left out", "", *(left_out or ["Nothing."])])
+        text = "\n\n".join(["# Results of the experiment", _origin(results), *read, *sections, _below(said), end])
+        (folder / PAGE).write_text(f"{text}\n", encoding="utf-8")
     except OSError as error:
         raise AVPError(f"{folder}: cannot write there: {error.strerror or error}") from None
+    return folder / PAGE
 
 
-def _write(results: Results, shown_maps: Sequence[str]) -> Path:
-    said = claims(results)
-    (results.folder / CLAIMS).write_text(said, encoding="utf-8")
-    parts = [_table(results, name, role, title) for name, (role, title) in _TABLES.items()]
-    parts += [_figure(results, name, title, made) for name, (title, made) in _figures(shown_maps).items()]
-    page = results.folder / PAGE
-    page.write_text(_page(results, parts, said), encoding="utf-8")
-    return page
-
-
-def _figures(shown_maps: Sequence[str]) -> dict[str, tuple[str, Callable[[Results], Made]]]:
+def _figures(shown_maps: Sequence[str]) -> dict[str, tuple[str, Callable[[Results], Drawn]]]:
     return {
         "figure3": ("Figure 3: coverage per view while training", cpv_while_training),
         "figure4": ("Figure 4: mean reward while training", reward_while_training),
@@ -90,114 +86,82 @@ def _figures(shown_maps: Sequence[str]) -> dict[str, tuple[str, Callable[[Result
     }
 
 
-def _table(results: Results, name: str, role: str, title: str) -> _Part:
+def _table(results: Results, name: str, role: str, title: str) -> str:
     table = make_table(results, role)
-    paths = {suffix: results.folder / f"{name}.{suffix}" for suffix in ("md", "csv")}
+    paths = [results.folder / f"{name}.{suffix}" for suffix in ("md", "csv")]
     if table is None:
-        for path in paths.values():
+        for path in paths:
             path.unlink(missing_ok=True)
-        reason = "no episode there is done" if results.scenes(role) else "no such scene in this experiment"
-        return _Part(title, None, reason)
-    texts = {"md": f"# {title}\n\n{table.markdown()}", "csv": table.csv()}
-    for suffix, text in texts.items():
-        paths[suffix].write_text(text, encoding="utf-8")
-    counts = sorted(set(table.episodes.values()))
-    episodes = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
-    caption = (
-        f"{', '.join(results.scenes(role))}: mean ± 95 % confidence interval over {_seeds(results)} (Student's t), "
-        f"{episodes} episodes of each method. [CSV]({name}.csv)"
+        raise Missing("no episode there is done" if results.scenes(role) else "no such scene in this experiment")
+    markdown, numbers, counts = table
+    for path, text in zip(paths, (f"# {title}\n\n{markdown}", numbers), strict=True):
+        path.write_text(text, encoding="utf-8")
+    episodes = " to ".join(str(count) for count in dict.fromkeys((min(counts), max(counts))))
+    return (
+        f"{', '.join(results.scenes(role))}: mean ± 95 % confidence interval over {results.seeds} (Student's t), "
+        f"{episodes} episodes of each method. [CSV]({name}.csv)\n\n{markdown.rstrip()}"
     )
-    return _Part(title, f"{caption}\n\n{table.markdown().rstrip()}")
 
 
-def _figure(results: Results, name: str, title: str, make: Callable[[Results], Made]) -> _Part:
+def _figure(results: Results, name: str, title: str, draw: Callable[[Results], Drawn]) -> str:
     path = results.folder / f"{name}.png"
-    try:
-        made = make(results)
-    except Missing as reason:
-        # One of an earlier state of the results would stand beside figures of this one.
-        path.unlink(missing_ok=True)
-        return _Part(title, None, str(reason))
-    save(made.picture, path)
-    return _Part(title, f"![{title}]({path.name})\n\n{made.caption}")
-
-
-def _page(results: Results, parts: Sequence[_Part], said: str) -> str:
-    lines = ["# Results of the experiment", _origin(results)]
-    reading = results.folder / READING
-    if reading.is_file():
-        lines.append(_below(reading.read_text(encoding="utf-8").strip()))
-    lines += [f"## {part.title}\n\n{part.text}" for part in parts if part.text is not None]
-    lines.append(_below(said.strip()))
-    left_out = [f"- {part.title}: {part.reason}." for part in parts if part.text is None]
-    lines.append("\n".join(["## Left out", "", *(left_out or ["Nothing."])]))
-    return "\n\n".join(lines) + "\n"
+    # One of an earlier state of the results would stand beside figures of this one.
+    path.unlink(missing_ok=True)
+    drawn = draw(results)
+    drawn.save(path)
+    return f"![{title}]({path.name})\n\n{drawn.caption}"
 
 
 def _below(text: str) -> str:
     """A page as a part of another: its headings one level deeper."""
-    return "\n".join(f"#{line}" if line.startswith("#") else line for line in text.splitlines())
+    return "\n".join(f"#{line}" if line.startswith("#") else line for line in text.strip().splitlines())
 
 
 def _origin(results: Results) -> str:
     origin, configuration = results.origin, results.configuration
-    machine = origin.get("machine") or {}
-    about = [
-        ("command", f"`{origin.get('command', 'not known')}`"),
-        ("preset", f"{configuration.get('preset', 'not known')}: {_settings(configuration)}"),
-        ("scenes", ", ".join(f"{scene['name']} ({scene['role']})" for scene in configuration["scenes"])),
-        ("commits", ", ".join(f"`{commit[:12]}`" for commit in origin.get("commits") or []) or "not known"),
-        ("machine", ", ".join(_machine(machine)) or "not known"),
-        ("versions", ", ".join(f"{name} {version}" for name, version in (origin.get("versions") or {}).items())),
-        ("finished", f"{origin.get('finished', 'not known')}, {origin.get('hours', '?')} hours of work in all cells"),
-        ("failed cells", str(len(results.failed)) + (" (see below)" if results.failed else "")),
-    ]
+    settings = ", ".join(f"{name} {configuration[name]}" for name in _SETTINGS if name in configuration)
+    about = {
+        "command": f"`{origin.get('command', 'not known')}`",
+        "preset": f"{configuration.get('preset', 'not known')}: {settings}",
+        "scenes": ", ".join(f"{scene['name']} ({scene['role']})" for scene in configuration["scenes"]),
+        "commits": ", ".join(f"`{commit[:12]}`" for commit in origin.get("commits") or []) or "not known",
+        "machine": _machine(origin.get("machine") or {}),
+        "versions": ", ".join(f"{name} {version}" for name, version in (origin.get("versions") or {}).items()),
+        "finished": f"{origin.get('finished', 'not known')}, {origin.get('hours', '?')} hours of work in all cells",
+        "failed cells": str(len(results.failed)) + (" (see below)" if results.failed else ""),
+    }
     made = f"Made from [`{FILE}`]({FILE}) by `python -m avp_experiment.report FOLDER`; data and settings are all in it."
-    return "\n".join([made, "", *(f"- {name}: {value}" for name, value in about)])
+    return "\n".join([made, "", *(f"- {name}: {value}" for name, value in about.items())])
 
 
-def _settings(configuration: Any) -> str:
-    wanted = (
-        "seeds",
-        "starts",
-        "budget",
-        "observation",
-        "steps",
-        "steps_rooms",
-        "width",
-        "height",
-        "reconstruction",
-        "iterations",
-    )
-    known = [f"{name} {configuration[name]}" for name in wanted if name in configuration]
-    return ", ".join(known)
-
-
-def _machine(machine: Any) -> list[str]:
+def _machine(machine: Mapping[str, Any]) -> str:
     cores = f"{machine['cores']} cores" if machine.get("cores") else None
-    gpu = machine.get("gpu") or "no GPU"
-    return [str(word) for word in (machine.get("platform"), machine.get("processor"), cores, gpu) if word]
+    words = (machine.get("platform"), machine.get("processor"), cores, machine.get("gpu") or "no GPU")
+    return ", ".join(str(word) for word in words if word)
 
 
-def _seeds(results: Results) -> str:
-    count = results.configuration.get("seeds", len({one.key[1] for one in results.rollouts}))
-    return f"{count} seed" if count == 1 else f"{count} seeds"
+@dataclass(frozen=True)
+class Report:
+    """Make every table and figure of an experiment from its results.json, and the page that holds them, results.md.
+
+    A file reading.md beside them, written by hand, becomes a part of the page. What cannot be made is left out; the
+    page says why.
+    """
+
+    folder: Positional[Path]
+    """Of an experiment: holds results.json."""
+    maps: tuple[str, ...] = DEFAULT_MAPS
+    """Methods of figure 5."""
 
 
-def main(argv: Sequence[str]) -> None:
+def main(options: Report) -> None:
     """Report."""
-    parser = argparse.ArgumentParser(prog="python -m avp_experiment.report", description=__doc__)
-    parser.add_argument("folder", type=Path, help="of an experiment: holds results.json")
-    parser.add_argument(
-        "--maps", nargs="+", metavar="METHOD", help=f"methods of figure 5 (default: {' '.join(DEFAULT_MAPS)})"
-    )
-    options = parser.parse_args(argv)
-    for name in options.maps or ():
+    if options.maps != DEFAULT_MAPS:
         known = read_results(options.folder).methods
-        if name not in known:
-            raise unknown_name("method of --maps", name, known)
-    page = write_report(options.folder, shown_maps=options.maps or DEFAULT_MAPS)
-    print(f"report: {page}")
+        for name in options.maps:
+            if name not in known:
+                raise unknown_name("method of --maps", name, known)
+    print(f"report: {write_report(options.folder, shown_maps=options.maps)}")
 
 
 if __name__ == "__main__":

@@ -1,136 +1,306 @@
-"""Everything that was found, gathered into the one file from which tables and figures are made."""
+"""`results.json`: everything that an experiment found, from which tables and figures are made."""
 
+import base64
 import json
 import os
 import platform
 import shutil
-from collections.abc import Sequence
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from avp_experiment.cells import COLLECT, RECONSTRUCT, TRAIN, Cell
-from avp_experiment.configuration import Configuration
-from avp_experiment.store import Store
-from avp_experiment.top_down import floor_map
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_experiment.cells import COLLECT, RECONSTRUCT, Cell, floor_map
+from avp_experiment.cells import TRAIN as TRAINING
+from avp_experiment.configuration import TRAIN, UNSEEN, Configuration, scene_slug
+from avp_experiment.folder import Folder, write_json
+from avp_habitat.errors import AVPError, UsageError
+from avp_habitat.metrics import FIGURES, Figure, figures
 from avp_habitat.provenance import PACKAGES, installed_versions
 
 FORMAT = 1
 FILE, PICTURES = "results.json", "pictures"
+CELLS = {"training": TRAINING, "rollouts": COLLECT, "reconstructions": RECONSTRUCT}
+"""Kinds of cells by their keys in the file."""
+Key = tuple[str, int, int]
+"""Scene, seed and start: what two methods have in common."""
 
 
-def gather(
-    configuration: Configuration, store: Store, cells: Sequence[Cell], *, command: str, hours: float
-) -> dict[str, Any]:
-    """The content of `results.json` (docs/experiment.md describes it) of what is done by now.
+@dataclass(frozen=True)
+class _Measured:
+    """What rollouts and reconstructions have in common."""
+
+    method: str
+    role: str
+    """Of its scene: train or unseen."""
+    key: Key
+    """Scene, seed and start."""
+
+
+@dataclass(frozen=True)
+class Episode(_Measured):
+    """One rollout."""
+
+    metrics: Mapping[str, float]
+    """Figures of the whole episode; shares within [0, 1]."""
+    coverage_curve: tuple[float, ...]
+    """Coverage after each view, within [0, 1]."""
+    floor: Mapping[str, Any] | None
+    """Its map (`floor_map`), kept of the first episode only."""
+
+
+@dataclass(frozen=True)
+class Reconstruction(_Measured):
+    """One reconstruction of an episode's first frames, or of all of them."""
+
+    frames: int
+    """How many frames it was made of."""
+    whole: bool
+    """Whether those are all of the episode."""
+    scores: Mapping[str, float]
+    """`psnr` in dB, `ssim`, `lpips`, as far as they could be computed: means over the held-out views."""
+    lpips_reason: str | None
+    """Why there is no LPIPS."""
+    visibility: float | None
+    """Share of the held-out pixels that its frames have seen."""
+    psnr_by_view: tuple[float | None, ...]
+    """In dB, of each held-out view."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """One training."""
+
+    method: str
+    seed: int
+    curves: Mapping[str, NDArray[np.float64]]
+    """`(n, 2)` steps and values by metric."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """Everything that an experiment found."""
+
+    folder: Path
+    configuration: Mapping[str, Any]
+    methods: tuple[str, ...]
+    """In the order of the tables."""
+    figures: Mapping[str, Figure]
+    """Those that users added, by name."""
+    origin: Mapping[str, Any]
+    """Command, commits, machine, versions."""
+    training: tuple[Training, ...]
+    rollouts: tuple[Episode, ...]
+    reconstructions: tuple[Reconstruction, ...]
+    failed: tuple[Mapping[str, str], ...]
+    """`cell`, `reason` and `log` (relative to the folder) of what was tried in vain."""
+
+    def scenes(self, role: str) -> list[str]:
+        """Names of the scenes of a role, in the experiment's order."""
+        return [scene["name"] for scene in self.configuration["scenes"] if scene["role"] == role]
+
+    @property
+    def seeds(self) -> str:
+        """How many, in words."""
+        count = self.configuration.get("seeds", "?")
+        return f"{count} seed" if count == 1 else f"{count} seeds"
+
+    def values(self, method: str, role: str, name: str) -> dict[Key, float]:
+        """A figure of a method by episode in scenes of a role, as far as it is known; a score of all its frames."""
+        of = (method, role)
+        scores = {one.key: one.scores for one in self.reconstructions if one.whole and (one.method, one.role) == of}
+        metrics = {one.key: one.metrics for one in self.rollouts if (one.method, one.role) == of}
+        found = metrics if any(name in figures for figures in metrics.values()) else scores
+        return {key: figures[name] for key, figures in found.items() if name in figures}
+
+    def reconstruction_curves(self, method: str, role: str) -> dict[Key, dict[int, Reconstruction]]:
+        """By episode: its reconstructions by their number of frames, in ascending order, none twice.
+
+        Only episodes that have more than one are there, unless no episode has.
+        """
+        found: dict[Key, dict[int, Reconstruction]] = {}
+        for one in sorted(self.reconstructions, key=lambda one: (one.frames, one.whole)):
+            if (one.method, one.role) == (method, role):
+                found.setdefault(one.key, {})[one.frames] = one
+        several = {key: curve for key, curve in found.items() if len(curve) > 1}
+        return several or found
+
+
+def floor_of(entry: Mapping[str, Any]) -> NDArray[np.uint16]:
+    """`(rows, columns)` numbers of a map, as its rollout's `floor.png` holds them.
+
+    Raises:
+        AVPError: the entry is damaged.
+    """
+    try:
+        packed = zlib.decompress(base64.b64decode(entry["floor"], validate=True))
+        return np.frombuffer(packed, dtype="<u2").reshape(entry["shape"]).astype(np.uint16)
+    except (KeyError, TypeError, ValueError, zlib.error) as error:
+        raise AVPError(f"a map of the results cannot be read: {error}") from None
+
+
+def read_results(folder: Path) -> Results:
+    """Read the results in an experiment's folder.
+
+    Raises:
+        UsageError: there is no such folder, or no `results.json` in it.
+        AVPError: that file is damaged or of another format.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        raise UsageError(f"{folder}: expected the folder of an experiment (with {FILE}), found none")
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise AVPError(f"{path}: expected JSON, could not read it: {error}") from None
+    if not isinstance(value, dict) or value.get("format") != FORMAT:
+        found = value.get("format") if isinstance(value, dict) else type(value).__name__
+        raise AVPError(f"{path}: expected results of format {FORMAT}, found {found!r}")
+    # Results of before users could add figures.
+    value.setdefault("figures", {})
+    found = {name: _part(path, value, name, made_of) for name, made_of in _PARTS.items()}
+    return Results(folder, **found)
+
+
+def _part(path: Path, value: Mapping[str, Any], name: str, made_of: Callable[[Any], Any]) -> Any:
+    try:
+        return made_of(value[name])
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise AVPError(f"{path}: {name}: missing or damaged: {error!r}") from None
+
+
+def _configuration(entry: Any) -> dict[str, Any]:
+    for scene in entry["scenes"]:
+        if scene["role"] not in (TRAIN, UNSEEN) or not isinstance(scene["name"], str):
+            raise ValueError(f"a scene without a name, or neither {TRAIN} nor {UNSEEN}: {scene}")
+    return dict(entry)
+
+
+def _training(entry: Any) -> Training:
+    curves = {name: np.array(points, float).reshape(-1, 2) for name, points in entry["curves"].items()}
+    return Training(entry["method"], int(entry["seed"]), curves)
+
+
+def _measured(entry: Any) -> tuple[str, str, Key]:
+    return entry["method"], entry["role"], (str(entry["scene"]), int(entry["seed"]), int(entry["start"]))
+
+
+def _numbers(entry: Any) -> dict[str, float]:
+    """What is known of named numbers."""
+    return {name: float(number) for name, number in entry.items() if isinstance(number, int | float)}
+
+
+def _episode(entry: Any) -> Episode:
+    curve = tuple(float(share) for share in entry["coverage_curve"])
+    return Episode(*_measured(entry), _numbers(entry["metrics"]), curve, entry.get("map"))
+
+
+def _reconstruction(entry: Any) -> Reconstruction:
+    seen = entry.get("visibility")
+    return Reconstruction(
+        *_measured(entry),
+        # An episode that stopped before has no more frames than it has.
+        frames=min(int(entry["frames"]), round(entry["views"])),
+        whole=bool(entry["whole"]),
+        scores=_numbers(entry["scores"]),
+        lpips_reason=entry.get("lpips_reason"),
+        visibility=None if seen is None else float(seen),
+        psnr_by_view=tuple(view.get("psnr") for view in entry["per_view"]),
+    )
+
+
+_PARTS: dict[str, Callable[[Any], Any]] = {
+    "configuration": _configuration,
+    "methods": tuple,
+    "figures": lambda entries: {name: Figure(**entry) for name, entry in entries.items()},
+    "origin": dict,
+    "training": lambda entries: tuple(map(_training, entries)),
+    "rollouts": lambda entries: tuple(map(_episode, entries)),
+    "reconstructions": lambda entries: tuple(map(_reconstruction, entries)),
+    "failed": lambda entries: tuple({name: one[name] for name in ("cell", "reason", "log")} for one in entries),
+}
+"""What each part of the file becomes."""
+
+
+def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], *, command: str) -> dict[str, Any]:
+    """Write `results.json` (docs/experiment.md describes it) of what is done by now, with pictures beside it.
 
     Args:
         configuration: of the experiment.
-        store: its folder.
+        folder: of the experiment.
         cells: all of them.
         command: that was typed.
-        hours: of work in all cells, one after another.
+
+    Returns:
+        The content.
     """
-    done = [(cell, record) for cell in cells if (record := store.record(cell)) is not None]
-    by_kind = {
-        kind: [(cell, record) for cell, record in done if cell.kind == kind] for kind in (TRAIN, COLLECT, RECONSTRUCT)
-    }
-    return {
+    done = [(cell, record) for cell in cells if (record := folder.record(cell)) is not None]
+    known = figures(configuration.metrics)
+    measured = {name for cell, record in done if cell.kind == COLLECT for name in record["facts"]["metrics"]}
+    results = {
         "format": FORMAT,
         "configuration": configuration.as_json(),
         "methods": [method.name for method in configuration.methods],
+        "figures": {name: asdict(known[name]) for name in sorted(measured & set(known) - set(FIGURES))},
         "origin": {
             "command": command,
             "commits": sorted({record["commit"] for _, record in done if record["commit"]}),
-            "machine": machine(),
+            "machine": _machine(),
             "versions": installed_versions(PACKAGES),
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-            "hours": round(hours, 2),
+            "hours": round(sum(record["seconds"] for _, record in done) / 3600, 2),
         },
-        "training": [_training(cell, record) for cell, record in by_kind[TRAIN]],
-        "rollouts": [_rollout(cell, record, store) for cell, record in by_kind[COLLECT]],
-        "reconstructions": [_reconstruction(cell, record, store) for cell, record in by_kind[RECONSTRUCT]],
+        **{part: [_entry(cell, folder) for cell, _ in done if cell.kind == kind] for part, kind in CELLS.items()},
         "failed": [
-            {"cell": cell.key, "reason": reason, "log": str(store.log(cell).relative_to(store.root))}
+            {"cell": cell.key, "reason": reason, "log": str(folder.log(cell).relative_to(folder.root))}
             for cell in cells
-            if not store.is_done(cell) and (reason := store.failure(cell)) is not None
+            if not folder.is_done(cell) and (reason := folder.failure(cell)) is not None
         ],
     }
+    for cell, _ in done:
+        _copy_pictures(cell, folder.root)
+    write_json(folder.root / FILE, results, separators=(",", ":"))
+    return results
 
 
-def write(results: dict[str, Any], folder: Path) -> Path:
-    """Write `results.json`, whole or not at all."""
-    path = folder / FILE
-    temporary = path.with_suffix(".part")
-    temporary.write_text(json.dumps(results, separators=(",", ":"), allow_nan=False) + "\n", encoding="utf-8")
-    temporary.replace(path)
-    return path
-
-
-def copy_pictures(store: Store, cells: Sequence[Cell]) -> None:
-    """Held-out views and their renders, out of the reconstructions that kept them, beside the results."""
-    target = store.root / PICTURES
-    for cell in cells:
-        source = cell.output(store.root) / PICTURES
-        if cell.scene is None or not source.is_dir():
-            continue
-        target.mkdir(exist_ok=True)
-        for path in sorted(source.glob("*.png")):
-            kind, _, number = path.stem.partition("_")
-            who = "truth" if kind == "truth" else cell.method.name
-            shutil.copyfile(path, target / f"{cell.scene.slug}-{who}-{int(number):02d}.png")
-
-
-def machine() -> dict[str, Any]:
-    """What the results were made on."""
+def _machine() -> dict[str, Any]:
     import torch
 
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return {
         "platform": platform.platform(),
-        "processor": _processor(),
+        "processor": names[0] if names else platform.processor() or platform.machine(),
         "cores": len(os.sched_getaffinity(0)),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
 
 
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+def _entry(cell: Cell, folder: Folder) -> dict[str, Any]:
+    record = folder.record(cell) or {}
+    entry = {"method": cell.method.name, "seed": cell.seed, "commit": record["commit"], "seconds": record["seconds"]}
+    if cell.scene is None:
+        return entry | record["facts"]
+    entry |= {"scene": cell.scene.name, "role": cell.scene.role, "start": cell.start}
+    if cell.kind == RECONSTRUCT:
+        return entry | _scored(cell, record["facts"], folder)
+    first = cell.seed == cell.start == 0
+    return entry | record["facts"] | {"map": floor_map(cell.output(folder.root)) if first else None}
 
 
-def _about(cell: Cell, record: dict[str, Any]) -> dict[str, Any]:
-    about = {"method": cell.method.name, "seed": cell.seed}
-    if cell.scene is not None:
-        about |= {"scene": cell.scene.name, "role": cell.scene.role, "start": cell.start}
-    return about | {"commit": record["commit"], "seconds": record["seconds"]}
-
-
-def _training(cell: Cell, record: dict[str, Any]) -> dict[str, Any]:
-    facts = record["facts"]
-    return _about(cell, record) | {name: facts[name] for name in ("steps", "curves", "run_id")}
-
-
-def _rollout(cell: Cell, record: dict[str, Any], store: Store) -> dict[str, Any]:
-    first = cell.seed == 0 and cell.start == 0
-    return _about(cell, record) | record["facts"] | {"map": floor_map(cell.output(store.root)) if first else None}
-
-
-def _reconstruction(cell: Cell, record: dict[str, Any], store: Store) -> dict[str, Any]:
+def _scored(cell: Cell, found: dict[str, Any], folder: Folder) -> dict[str, Any]:
     assert cell.needs is not None
-    found, rollout = record["facts"], store.record(cell.needs)
+    rollout = folder.record(cell.needs)
     assert rollout is not None
-    views = round(rollout["facts"]["metrics"]["views"])
-    seen = found.get("visibility") or {}
+    views, seen = round(rollout["facts"]["metrics"]["views"]), found.get("visibility") or {}
     shares = seen.get("per_view") or [None] * len(found["per_view"])
-    per_view = [
-        {name: view.get(name) for name in ("psnr", "ssim", "lpips")} | {"visibility": share}
-        for view, share in zip(found["per_view"], shares, strict=True)
-    ]
-    return _about(cell, record) | {
+    return {
         "frames": cell.frames or views,
         "views": views,
         "whole": cell.frames is None,
@@ -138,5 +308,18 @@ def _reconstruction(cell: Cell, record: dict[str, Any], store: Store) -> dict[st
         "scores": found["scores"],
         "lpips_reason": found.get("lpips_reason"),
         "visibility": seen.get("visibility"),
-        "per_view": per_view,
+        "per_view": [
+            {name: view.get(name) for name in ("psnr", "ssim", "lpips")} | {"visibility": share}
+            for view, share in zip(found["per_view"], shares, strict=True)
+        ],
     }
+
+
+def _copy_pictures(cell: Cell, root: Path) -> None:
+    """Held-out views and their renders, out of a reconstruction that kept them, to beside the results."""
+    for path in sorted((cell.output(root) / PICTURES).glob("*.png")):
+        assert cell.scene is not None
+        kind, _, number = path.stem.partition("_")
+        shown = "truth" if kind == "truth" else cell.method.name
+        (root / PICTURES).mkdir(exist_ok=True)
+        shutil.copyfile(path, root / PICTURES / f"{scene_slug(cell.scene.name)}-{shown}-{int(number):02d}.png")

@@ -1,50 +1,56 @@
-"""Doing what is left of an experiment: several cells at a time, each as soon as what it needs is there."""
+"""Doing what is left of an experiment: several cells at a time, each in a process of its own with a log file.
 
+Importing torch, nerfstudio and Stable-Baselines3 takes 10 to 20 seconds of a core, which hundreds of cells would pay;
+multiprocessing's forkserver pays it once.
+"""
+
+import importlib
 import multiprocessing
 import os
+import signal
 import sys
+import threading
 import time
-from collections import defaultdict
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from multiprocessing.connection import wait
+from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from avp_experiment.cells import COLLECT, RECONSTRUCT, TRAIN, Cell
-from avp_experiment.execute import Order, execute, last_words
-from avp_experiment.store import Store
-from avp_habitat.command import progress
+from avp_experiment.cells import Cell, facts_of
+from avp_experiment.folder import Folder
+from avp_habitat import command
+from avp_habitat.errors import AVPError
+from avp_habitat.provenance import git_commit
 
-PRELOAD = ("avp_experiment.preload",)
-_GUESS_S = {TRAIN: 120.0, COLLECT: 10.0, RECONSTRUCT: 30.0}
-_POLL_S = 1.0
-_PATIENCE_S = 30.0
+PRELOAD = ("avp_sb3", "avp_nerfstudio.method.reconstruction", "avp_habitat.collect", "avp_experiment.runner")
+"""Everything heavy that cells use; multiprocessing passes over what is not installed."""
+_MLFLOW_OURS = ("MLFLOW_RUN_ID", "MLFLOW_EXPERIMENT_ID", "MLFLOW_EXPERIMENT_NAME")
+_TERMINATION_S = 30.0
 
 
-@dataclass
-class _Running:
-    """A cell that is being done."""
-
-    cell: Cell
-    process: Any
-    began: float
+def environment(tracking_uri: str) -> dict[str, str]:
+    """Variables of the cells: this process's, one thread each, and not MLflow's run, which is the experiment's own."""
+    kept = {name: value for name, value in os.environ.items() if name not in _MLFLOW_OURS}
+    return kept | {"OMP_NUM_THREADS": "1", "MLFLOW_TRACKING_URI": tracking_uri, "PYTHONWARNINGS": "ignore"}
 
 
 @dataclass
 class Runner:
     """The scheduler."""
 
-    store: Store
+    folder: Folder
+    """Of the experiment."""
     jobs: int
     """Cells at a time."""
     environment: dict[str, str]
     """Of their processes."""
     preload: Sequence[str] = PRELOAD
     """Modules imported once, before any cell; with none each cell has a new process, as Habitat-Sim wants it."""
-    seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-    """How long cells of each kind took."""
     failed: dict[str, str] = field(default_factory=dict)
     """Reasons by the cell's key."""
 
@@ -54,108 +60,135 @@ class Runner:
         Args:
             cells: each after the one that it needs.
         """
-        for cell in cells:
-            if (record := self.store.record(cell)) is not None:
-                self.seconds[cell.kind].append(record["seconds"])
-        waiting = [cell for cell in cells if not self.store.is_done(cell)]
         # Libraries read these when they are loaded, which is in the process from which cells are forked: with two
         # threads each, two reconstructions on two cores were ten times slower.
-        os.environ.update({name: value for name, value in self.environment.items() if name.endswith("_NUM_THREADS")})
-        context = multiprocessing.get_context("forkserver" if self.preload else "spawn")
+        os.environ.update({name: self.environment[name] for name in ("OMP_NUM_THREADS", "PYTHONWARNINGS")})
+        context: Any = multiprocessing.get_context("forkserver" if self.preload else "spawn")
         if self.preload:
             context.set_forkserver_preload(list(self.preload))
-        running: list[_Running] = []
+        waiting = [cell for cell in cells if not self.folder.is_done(cell)]
+        running: dict[Any, Cell] = {}
         done = len(cells) - len(waiting)
-        options = {"total": len(cells), "initial": done, "desc": "experiment", "unit": "cell", "bar_format": _BAR}
-        with progress(miniters=0, **options) as bar:
+        with command.progress(total=len(cells), initial=done, desc="experiment", unit="cell") as bar:
             try:
                 while waiting or running:
                     self._start(context, waiting, running)
-                    bar.set_postfix_str(self._state(waiting, running), refresh=sys.stderr.isatty())
-                    bar.update(self._collect(running))
-                    bar.update(self._pass_over(waiting))
+                    bar.set_postfix_str(", ".join(cell.key for cell in running.values()))
+                    wait([process.sentinel for process in running], timeout=1)
+                    bar.update(self._collect(running) + self._pass_over(waiting))
             except BaseException:
-                self._stop(running)
+                _stop(list(running))
                 raise
 
-    def _start(self, context: Any, waiting: list[Cell], running: list[_Running]) -> None:
-        for cell in list(waiting):
+    def _start(self, context: Any, waiting: list[Cell], running: dict[Any, Cell]) -> None:
+        for cell in [cell for cell in waiting if cell.needs is None or self.folder.is_done(cell.needs)]:
             if len(running) >= self.jobs:
                 return
-            if cell.needs is not None and not self.store.is_done(cell.needs):
-                continue
             waiting.remove(cell)
-            order = Order(cell, self.store.prepare(cell), self.store.root, self.environment)
-            process = context.Process(target=execute, args=(order,), name=cell.key)
+            arguments = (cell, self.folder.prepare(cell), self.folder.root, self.environment)
+            process = context.Process(target=execute, args=arguments, name=cell.key)
             process.start()
-            running.append(_Running(cell, process, time.monotonic()))
+            running[process] = cell
 
-    def _collect(self, running: list[_Running]) -> int:
-        """Wait a moment; how many cells have ended."""
-        wait([one.process.sentinel for one in running], timeout=_POLL_S)
-        ended = [one for one in running if one.process.exitcode is not None]
-        for one in ended:
-            running.remove(one)
-            if one.process.exitcode == 0 and self.store.record(one.cell) is not None:
-                self.seconds[one.cell.kind].append(time.monotonic() - one.began)
-            else:
-                self._fail(one.cell, f"{_ending(one.process.exitcode)}: {last_words(self.store.log(one.cell))}")
+    def _collect(self, running: dict[Any, Cell]) -> int:
+        """Judge the cells that have ended; how many."""
+        ended = [process for process in running if process.exitcode is not None]
+        for process in ended:
+            cell, code = running.pop(process), process.exitcode
+            if code or self.folder.record(cell) is None:
+                ending = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
+                self.failed[cell.key] = reason = f"{ending}: {_last_lines(self.folder.log(cell))}"
+                self.folder.fail(cell, reason)
+                tqdm.write(f"failed: {cell.key}: {reason}", file=sys.stderr)
         return len(ended)
 
     def _pass_over(self, waiting: list[Cell]) -> int:
         """Drop cells that have nothing to do, or whose need has failed; how many."""
-        dropped = 0
-        for cell in list(waiting):
-            if self.store.is_empty(cell):
-                waiting.remove(cell)
-                dropped += 1
-            elif cell.needs is not None and cell.needs.key in self.failed:
-                waiting.remove(cell)
-                self._fail(cell, f"needs {cell.needs.key}, which failed", told=False)
-                dropped += 1
-        return dropped
-
-    def _fail(self, cell: Cell, reason: str, *, told: bool = True) -> None:
-        self.failed[cell.key] = reason
-        if told:
-            self.store.fail(cell, reason)
-            tqdm.write(f"failed: {cell.key}: {reason}", file=sys.stderr)
-
-    def _state(self, waiting: list[Cell], running: list[_Running]) -> str:
-        left = sum(self._expected(cell) for cell in waiting)
-        now = time.monotonic()
-        left += sum(max(self._expected(one.cell) - (now - one.began), 0) for one in running)
-        failures = f", {len(self.failed)} failed" if self.failed else ""
-        return f"about {_span(left / self.jobs)} left{failures}; now {', '.join(one.cell.key for one in running)}"
-
-    def _expected(self, cell: Cell) -> float:
-        known = self.seconds[cell.kind]
-        return sum(known) / len(known) if known else _GUESS_S[cell.kind]
-
-    def _stop(self, running: list[_Running]) -> None:
-        """End what is running, as Ctrl-C would; what does not end in time is killed."""
-        for one in running:
-            one.process.terminate()
-        until = time.monotonic() + _PATIENCE_S
-        for one in running:
-            one.process.join(max(until - time.monotonic(), 0))
-            if one.process.exitcode is None:
-                one.process.kill()
+        lost = [cell for cell in waiting if cell.needs is not None and cell.needs.key in self.failed]
+        self.failed |= {cell.key: f"needs {cell.needs.key}, which failed" for cell in lost if cell.needs}
+        dropped = [cell for cell in waiting if cell in lost or self.folder.is_empty(cell)]
+        for cell in dropped:
+            waiting.remove(cell)
+        return len(dropped)
 
 
-_BAR = "{desc}: {n_fmt}/{total_fmt} cells |{bar}| {elapsed}{postfix}"
+def _stop(running: Sequence[Any]) -> None:
+    """End processes as Ctrl-C would; what does not end in time is killed."""
+    for process in running:
+        process.terminate()
+    until = time.monotonic() + _TERMINATION_S
+    for process in running:
+        process.join(max(until - time.monotonic(), 0))
+        if process.exitcode is None:
+            process.kill()
 
 
-def default_jobs() -> int:
-    """One cell per core that this process may use."""
-    return len(os.sched_getaffinity(0))
+def _last_lines(log: Path) -> str:
+    """The error that a log ends with, else its last three lines that say something, as one."""
+    try:
+        text = log.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return "no log"
+    said = [line.strip() for line in text.replace("\r", "\n").splitlines() if line.strip()]
+    errors = [line for line in said if line.startswith("error: ")]
+    return errors[-1].removeprefix("error: ") if errors else " | ".join(said[-3:])[-400:]
 
 
-def _ending(code: int | None) -> str:
-    return f"killed by signal {-code}" if code is not None and code < 0 else f"exit code {code}"
+def execute(cell: Cell, words: Sequence[str], root: Path, variables: dict[str, str]) -> None:
+    """Run a cell's command in this process, keep what came of it, and end the process with the command's exit code.
+
+    Args:
+        cell: what is done.
+        words: the command line, `python -m MODULE …`.
+        root: the experiment's folder.
+        variables: of the environment.
+    """
+    threading.Thread(target=_end_with_experiment, name="end with the experiment", daemon=True).start()
+    os.environ.clear()
+    os.environ.update(variables)
+    folder = Folder(root)
+    with folder.log(cell).open("a", encoding="utf-8") as log:
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+            os.dup2(log.fileno(), stream.fileno())
+        started = time.monotonic()
+        print(f"$ {cell.command}", flush=True)
+        code = _run(words) or _finish(folder, cell, time.monotonic() - started)
+        sys.stdout.flush()
+        sys.stderr.flush()
+    sys.exit(code)
 
 
-def _span(seconds: float) -> str:
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+def _run(words: Sequence[str]) -> int:
+    """The exit code of a command line; its program runs in this process."""
+    try:
+        return command.run(importlib.import_module(words[2]).main, words[3:])
+    except SystemExit as end:
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:
+        traceback.print_exc()
+        return 1
+
+
+def _finish(folder: Folder, cell: Cell, seconds: float) -> int:
+    finished = datetime.now(UTC).isoformat(timespec="seconds")
+    about = {"seconds": round(seconds, 1), "commit": git_commit(), "finished": finished}
+    try:
+        folder.finish(cell, {**about, "facts": facts_of(cell, folder.root)})
+    except (AVPError, OSError, ValueError, KeyError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _end_with_experiment() -> None:
+    """End this process when the experiment ends, also by SIGKILL, or two programs would write one cell.
+
+    The process that forked this one lives on as long as its children do, so that waiting for that one is no help.
+    """
+    experiment = multiprocessing.parent_process()
+    assert experiment is not None
+    experiment.join()
+    os.kill(os.getpid(), signal.SIGKILL)

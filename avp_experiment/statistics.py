@@ -1,4 +1,4 @@
-"""How well what the frames have seen predicts the reconstruction: points, and their rank correlations."""
+"""Means over seeds, differences between methods, and how well what the frames have seen predicts the reconstruction."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from avp_experiment.stored import Key, Results
-from avp_habitat.metrics import CONFIDENCE, mean_and_half_width
+from avp_experiment.results import Key, Results
+from avp_habitat.metrics import CONFIDENCE, Figure, mean_and_half_width
 
 RESAMPLES = 2000
 _BOOTSTRAP_SEED = 0
@@ -23,23 +23,16 @@ class Summary:
     half_width: float
     """Of the interval (Student's t over seeds); nan for one seed."""
     seeds: int
-    """How many."""
 
     @property
-    def low(self) -> float:
-        """Lower end of the interval; nan for one seed."""
-        return self.mean - self.half_width
+    def interval(self) -> tuple[float, float]:
+        """Its ends; nan for one seed."""
+        return self.mean - self.half_width, self.mean + self.half_width
 
-    @property
-    def high(self) -> float:
-        """Upper end of the interval; nan for one seed."""
-        return self.mean + self.half_width
-
-    def text(self, *, digits: int, scale: float = 1.0, sign: bool = False, unit: str = "") -> str:
-        """Mean ± half the interval, without ± for one seed."""
-        shown = f"{scale * self.mean:{'+' if sign else ''}.{digits}f}"
-        shown += "" if np.isnan(self.half_width) else f" ± {abs(scale) * self.half_width:.{digits}f}"
-        return f"{shown} {unit}".rstrip()
+    def text(self, figure: Figure, *, sign: bool = False) -> str:
+        """Mean ± half the interval, without ± for one seed, as a figure is shown; no unit."""
+        shown = figure.text(self.mean, self.half_width)
+        return f"+{shown}" if sign and not shown.startswith("-") else shown
 
 
 @dataclass(frozen=True)
@@ -47,17 +40,15 @@ class Correlation:
     """Spearman's rank correlation ρ with a bootstrap interval."""
 
     rho: float
-    """Within [-1, 1]."""
     low: float
     """Lower end of the 95 % interval; nan where there is one rollout only."""
     high: float
-    """Upper end."""
     points: int
     """Reconstructions."""
     rollouts: int
     """That they were made of; what the bootstrap draws."""
 
-    def text(self) -> str:
+    def __str__(self) -> str:
         """As ρ = 0.91 [0.85, 0.95]."""
         interval = "" if np.isnan(self.low) else f" [{self.low:.2f}, {self.high:.2f}]"
         return f"ρ = {self.rho:.2f}{interval}"
@@ -97,43 +88,25 @@ def saved_share(less: Mapping[Key, float], more: Mapping[Key, float]) -> Summary
 
 
 def at_views(curve: Mapping[int, float], views: float) -> float | None:
-    """A figure at a number of views, linear between the measured ones; None outside of them.
-
-    Args:
-        curve: by number of views, ascending.
-        views: asked for.
-    """
-    measured = list(curve)
+    """A figure at a number of views, by number of views, linear between measured ones; None outside of them."""
+    measured = sorted(curve)
     if not measured or not measured[0] <= views <= measured[-1]:
         return None
-    return float(np.interp(views, measured, list(curve.values())))
+    return float(np.interp(views, measured, [curve[k] for k in measured]))
 
 
 def views_to_reach(curve: Mapping[int, float], target: float) -> float | None:
-    """The least number of views at which a figure reaches a target, linear between measured ones; None for never.
-
-    Args:
-        curve: by number of views, ascending. A target that the first one has reached is answered with that one.
-        target: of the figure.
-    """
-    before: tuple[int, float] | None = None
-    for views, value in curve.items():
-        if value >= target:
-            if before is None:
-                return float(views)
-            share = (target - before[1]) / (value - before[1])
-            return before[0] + share * (views - before[0])
-        before = (views, value)
-    return None
+    """The least number of views, of those measured or between, at which a figure reaches a target; None for never."""
+    measured, values = list(curve), list(curve.values())
+    reached = next((place for place, value in enumerate(values) if value >= target), None)
+    if not reached:
+        return None if reached is None else float(measured[0])
+    both = slice(reached - 1, reached + 1)
+    return float(np.interp(target, values[both], measured[both]))
 
 
 def spearman(x: ArrayLike, y: ArrayLike, rollout: Sequence[object]) -> Correlation | None:
-    """Spearman's ρ over reconstructions; its interval draws rollouts, as those of one rollout are not independent.
-
-    Args:
-        x: `(n,)`.
-        y: `(n,)`.
-        rollout: `(n,)` which one each point belongs to.
+    """Spearman's ρ of `(n,)` and `(n,)`; its interval draws whole rollouts, `(n,)`, whose points are not independent.
 
     Returns:
         None for fewer than three points, or where one of the two does not vary.
@@ -141,22 +114,15 @@ def spearman(x: ArrayLike, y: ArrayLike, rollout: Sequence[object]) -> Correlati
     x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
         return None
-    names = {name: number for number, name in enumerate(dict.fromkeys(rollout))}
-    member = np.array([names[name] for name in rollout])
-    low, high = _bootstrap(x, y, member, len(names)) if len(names) > 1 else (np.nan, np.nan)
-    return Correlation(float(_rho(x, y, np.ones((1, len(x))))[0]), low, high, len(x), len(names))
-
-
-def _bootstrap(x: NDArray, y: NDArray, member: NDArray, rollouts: int) -> tuple[float, float]:
-    """Percentile interval over draws of whole rollouts; a rollout drawn k times counts k times."""
-    rng = np.random.default_rng(_BOOTSTRAP_SEED)
-    times = rng.multinomial(rollouts, np.full(rollouts, 1 / rollouts), size=RESAMPLES)
-    found = _rho(x, y, times[:, member].astype(np.float64))
-    found = found[np.isfinite(found)]
-    if not len(found):
-        return np.nan, np.nan
-    low, high = np.quantile(found, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return float(low), float(high)
+    names = list(dict.fromkeys(rollout))
+    low = high = np.nan
+    if len(names) > 1:
+        # A rollout that is drawn k times counts k times.
+        rng = np.random.default_rng(_BOOTSTRAP_SEED)
+        times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), size=RESAMPLES).astype(np.float64)
+        drawn = _rho(x, y, times[:, [names.index(name) for name in rollout]])
+        low, high = np.nanquantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Correlation(float(_rho(x, y, np.ones((1, len(x))))[0]), float(low), float(high), len(x), len(names))
 
 
 def _rho(x: NDArray, y: NDArray, times: NDArray) -> NDArray:
@@ -180,7 +146,7 @@ def _ranks(values: NDArray, times: NDArray) -> NDArray:
     return (np.cumsum(together, axis=1) - together / 2)[:, place]
 
 
-POINT_NAMES = ("visibility", "coverage")
+PREDICTORS = ("visibility", "coverage")
 """What may predict PSNR."""
 
 
@@ -189,33 +155,14 @@ class Point:
     """One reconstruction."""
 
     method: str
-    """That took its views."""
-    scene: str
-    """Its name."""
     rollout: tuple[str, str, int, int]
     """Method, scene, seed and start."""
     whole: bool
     """Whether it was made of all frames of its episode."""
-    visibility: float
-    """Share of the held-out pixels that its frames have seen."""
-    coverage: float
-    """Share of the navigable cells that its frames have observed."""
+    shares: Mapping[str, float]
+    """Of the held-out pixels (`visibility`) and of the navigable cells (`coverage`) that its frames have seen."""
     psnr: float
     """In dB."""
-
-    def share(self, name: str) -> float:
-        """Visibility or coverage."""
-        return self.visibility if name == "visibility" else self.coverage
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A correlation with its name."""
-
-    where: str
-    """Which reconstructions."""
-    found: Correlation | None
-    """None where there are too few."""
 
 
 def points_of(results: Results) -> list[Point]:
@@ -223,37 +170,26 @@ def points_of(results: Results) -> list[Point]:
     curves = {(one.method, *one.key): one.coverage_curve for one in results.rollouts}
     points = []
     for one in results.reconstructions:
-        curve = curves.get((one.method, *one.key), ())
-        if one.visibility is None or "psnr" not in one.scores or not 1 <= one.frames <= len(curve):
-            continue
         rollout = (one.method, *one.key)
-        points.append(
-            Point(one.method, one.key[0], rollout, one.whole, one.visibility, curve[one.frames - 1], one.scores["psnr"])
-        )
+        curve = curves.get(rollout, ())
+        if one.visibility is not None and "psnr" in one.scores and 1 <= one.frames <= len(curve):
+            shares = {"visibility": one.visibility, "coverage": curve[one.frames - 1]}
+            points.append(Point(one.method, rollout, one.whole, shares, one.scores["psnr"]))
     return points
 
 
-def correlations(points: Sequence[Point], name: str) -> list[Entry]:
-    """Spearman's ρ of visibility or coverage with PSNR: over all, of whole episodes, of first frames, in each scene.
-
-    Args:
-        points: of all reconstructions.
-        name: visibility or coverage.
-    """
-    whole = [point for point in points if point.whole]
-    groups = {"all": list(points), "whole episodes": whole, "first frames": [one for one in points if not one.whole]}
-    scenes = list(dict.fromkeys(point.scene for point in points))
+def correlations(points: Sequence[Point], name: str) -> dict[str, Correlation | None]:
+    """Spearman's ρ of a predictor with PSNR: over all, of whole episodes, of first frames, in each scene."""
+    groups = {
+        "all": list(points),
+        "whole episodes": [point for point in points if point.whole],
+        "first frames": [point for point in points if not point.whole],
+    }
+    scenes = list(dict.fromkeys(point.rollout[1] for point in points))
     for scene in scenes if len(scenes) > 1 else []:
-        groups[f"all in {scene}"] = [point for point in points if point.scene == scene]
-        groups[f"whole episodes in {scene}"] = [point for point in whole if point.scene == scene]
-    return [
-        Entry(
-            where,
-            spearman(
-                [point.share(name) for point in group],
-                [point.psnr for point in group],
-                [point.rollout for point in group],
-            ),
-        )
+        groups[f"all in {scene}"] = [point for point in points if point.rollout[1] == scene]
+        groups[f"whole episodes in {scene}"] = [point for point in groups[f"all in {scene}"] if point.whole]
+    return {
+        where: spearman([p.shares[name] for p in group], [p.psnr for p in group], [p.rollout for p in group])
         for where, group in groups.items()
-    ]
+    }

@@ -2,16 +2,14 @@
 
 import os
 from collections import defaultdict
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from avp_habitat.metrics import mean_and_half_width
 from avp_habitat.provenance import flat
 from avp_habitat.tracking.experiments import NAME_VARIABLE, existing_run, find_run
 from avp_habitat.tracking.names import KIND_TAG, METHOD_TAG, PARENT_TAG, POLICY_TAG, SCENE_TAG
-from avp_habitat.tracking.run import NewRun, Status, TrackedRun, join_run, start_run
+from avp_habitat.tracking.run import NewRun, TrackedRun, join_run, start_run
 from avp_habitat.tracking.stores import DEFAULT_ADDRESS, absolute, connect
 
 EXPERIMENT = "avp-experiment"
@@ -19,20 +17,7 @@ EXPERIMENT = "avp-experiment"
 KIND = "experiment"
 _ARTIFACTS = ("*.md", "*.csv", "*.png", "results.json", "experiment.json")
 _SHOWN = ("views", "coverage", "annd_m", "ei", "path_length_m", "visibility", "collisions", "stopped")
-
-
-@dataclass
-class Parent:
-    """The parent run."""
-
-    run: TrackedRun
-    """Where the tables go."""
-    experiment: str
-    """Name of its MLflow experiment, in which the trainings are made too."""
-
-    def close(self, status: Status) -> None:
-        """End it; one of `mlflow run` gets its end from there."""
-        self.run.close(status)
+Figures = dict[str, float]
 
 
 def tracking_uri() -> str:
@@ -40,8 +25,8 @@ def tracking_uri() -> str:
     return absolute(os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_ADDRESS)
 
 
-def open_parent(name: str) -> Parent:
-    """The run that `mlflow run` has begun, else a new one.
+def open_parent(name: str) -> tuple[TrackedRun, str]:
+    """The run that `mlflow run` has begun, else a new one; and the MLflow experiment, in which trainings are made too.
 
     Raises:
         TrackingError: the store cannot be used.
@@ -51,75 +36,50 @@ def open_parent(name: str) -> Parent:
         client = connect(address)
         identity = existing_run(client, begun).info.experiment_id
         client.set_tag(begun, KIND_TAG, KIND)
-        return Parent(join_run(address, begun), client.get_experiment(identity).name)
+        return join_run(address, begun), client.get_experiment(identity).name
     experiment = os.environ.get(NAME_VARIABLE) or EXPERIMENT
-    run = start_run(address, NewRun(experiment=experiment, name=name, tags={KIND_TAG: KIND}))
-    return Parent(run, experiment)
+    return start_run(address, NewRun(experiment=experiment, name=name, tags={KIND_TAG: KIND})), experiment
 
 
-def log_results(parent: Parent, results: dict[str, Any], folder: Path) -> None:
-    """Tables, figures and means into the parent, its trainings below it, and a run for each method, scene and seed.
-
-    Raises:
-        TrackingError: the store cannot be used.
-    """
-    run = parent.run
+def log_results(run: TrackedRun, experiment: str, results: Mapping[str, Any], folder: Path) -> None:
+    """Tables, figures and means into the parent, its trainings below it, and a run for each method, scene and seed."""
     settings = {name: value for name, value in results["configuration"].items() if name != "scenes"}
     scenes = {f"scene.{scene['role']}.{i}": scene["name"] for i, scene in enumerate(results["configuration"]["scenes"])}
     run.params(flat({"experiment": settings}) | scenes)
     for pattern in _ARTIFACTS:
         for path in sorted(folder.glob(pattern)):
             run.file(path)
-    by_method: dict[tuple[str, str], list[dict[str, float]]] = defaultdict(list)
-    for key, figures in _by_seed(results).items():
-        by_method[key[:2]].append(figures)
-        _child(parent, key, figures)
-    for (method, role), seeds in by_method.items():
-        run.metrics(_means(f"{role}/{method}", seeds), 0)
+    by_method: dict[str, list[Figures]] = defaultdict(list)
+    for (method, role, scene, seed), figures in _by_seed(results).items():
+        by_method[f"{role}/{method}"].append(figures)
+        tags = {POLICY_TAG: method, SCENE_TAG: scene, METHOD_TAG: "experiment", "avp.role": role}
+        tags |= {KIND_TAG: "experiment-cell"}
+        name = f"{method} on {scene} (seed {seed})"
+        child = start_run(run.address, NewRun(experiment=experiment, name=name, tags=tags, parent=run.run_id))
+        child.params({"method": method, "scene": scene, "role": role, "seed": seed})
+        child.metrics({f"eval/{name}": value for name, value in figures.items()}, 0)
+        child.close("FINISHED")
+    for prefix, seeds in by_method.items():
+        common = set.intersection(*map(set, seeds))
+        run.metrics({f"{prefix}/{name}": sum(one[name] for one in seeds) / len(seeds) for name in sorted(common)}, 0)
     run.metrics({"failed_cells": float(len(results["failed"]))}, 0)
     run.flush()
-    _adopt(run, (training["run_id"] for training in results["training"]))
+    _put_below(run, (training["run_id"] for training in results["training"]))
 
 
-def _by_seed(results: dict[str, Any]) -> dict[tuple[str, str, str, int], dict[str, float]]:
+def _by_seed(results: Mapping[str, Any]) -> dict[tuple[str, str, str, int], Figures]:
     """Means over starts, by method, role, scene and seed."""
     found: dict[tuple[str, str, str, int], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for part in (*results["rollouts"], *(one for one in results["reconstructions"] if one["whole"])):
         figures = found[part["method"], part["role"], part["scene"], part["seed"]]
-        values = part.get("scores") or {name: part["metrics"].get(name) for name in _SHOWN}
-        for name, value in values.items():
-            if value is not None:
-                figures[f"eval/{name}"].append(value)
+        names = part.get("scores") or (*_SHOWN, *results["figures"])
+        for name in names:
+            if (value := part.get("scores", part.get("metrics", {})).get(name)) is not None:
+                figures[name].append(value)
     return {key: {name: sum(values) / len(values) for name, values in one.items()} for key, one in found.items()}
 
 
-def _means(prefix: str, seeds: list[dict[str, float]]) -> dict[str, float]:
-    names = set.intersection(*(set(seed) for seed in seeds))
-    return {
-        f"{prefix}/{name.removeprefix('eval/')}": float(mean_and_half_width([seed[name] for seed in seeds])[0])
-        for name in sorted(names)
-    }
-
-
-def _child(parent: Parent, key: tuple[str, str, str, int], figures: dict[str, float]) -> None:
-    method, role, scene, seed = key
-    tags = {
-        POLICY_TAG: method,
-        SCENE_TAG: scene,
-        METHOD_TAG: "experiment",
-        "avp.role": role,
-        KIND_TAG: "experiment-cell",
-    }
-    new = NewRun(
-        experiment=parent.experiment, name=f"{method} on {scene} (seed {seed})", tags=tags, parent=parent.run.run_id
-    )
-    child = start_run(parent.run.address, new)
-    child.params({"method": method, "scene": scene, "role": role, "seed": seed})
-    child.metrics(figures, 0)
-    child.close("FINISHED")
-
-
-def _adopt(run: TrackedRun, trainings: Iterable[str | None]) -> None:
+def _put_below(run: TrackedRun, trainings: Iterable[str | None]) -> None:
     """Show the trainings below the parent, also those that an earlier start of the experiment made."""
     client = connect(run.address)
     for run_id in trainings:

@@ -1,15 +1,27 @@
 """Figures of episodes and rollouts, what their names mean, and means with their confidence intervals."""
 
 import math
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Literal
+from numbers import Real
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from avp_habitat.sight.visibility import ALIKE_DEG, ALIKE_DISTANCE, PARALLAX_DEG
+from avp_habitat import plugins
+from avp_habitat.errors import UsageError
 
 Float = NDArray[np.floating]
+
+
+ALIKE_DEG = 60.0
+"""A frame sees a surface as the held-out view does when its ray is turned by no more than this, degrees."""
+ALIKE_DISTANCE = 2.0
+"""And when it stands no more than this many times as far away."""
+PARALLAX_DEG = 10.0
+"""Rays this far apart show how far away a surface is, degrees."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +114,80 @@ def explained(*terms: str) -> str:
         *terms: of `TERMS`.
     """
     return "; ".join(f"{term}: {TERMS[term]}" for term in terms)
+
+
+METRICS_HELP = "further metrics: names that other distributions register, or MODULE:FUNCTION"
+"""What a command line says of its option for metrics."""
+Of = Literal["episode", "rollout"]
+MetricFunction = Callable[[Any], float]
+"""A figure of an episode's `Trajectory` or of a `Rollout`, with what `metric` declares about it."""
+
+
+def metric(figure: Figure, *, of: Of = "episode") -> Callable[[MetricFunction], MetricFunction]:
+    """Decorator of a function that computes one more figure.
+
+    Args:
+        figure: how it is called and shown; its name may not be one of `FIGURES`.
+        of: what the function takes: the `Trajectory` of a finished episode, or a `Rollout` with its pictures.
+    """
+    return plugins.declares(figure=figure, of=of)
+
+
+def find_metrics(chosen: Sequence[str | MetricFunction]) -> list[Any]:
+    """The functions behind the names of metrics: `module:function`, or what another distribution registers.
+
+    Raises:
+        UsageError: there is no such metric, it declares no figure, or two figures have one name.
+    """
+    found = [plugins.find("avp.metrics", name, {}) for name in chosen]
+    taken = set(FIGURES)
+    for name, function in zip(chosen, found, strict=True):
+        said = plugins.name_of(name)
+        figure = getattr(function, "figure", None)
+        if not (callable(function) and isinstance(figure, Figure)):
+            raise UsageError(
+                f"metric {said!r}: expected a function that `metric(Figure(...))` decorates, got {function!r}"
+            )
+        if figure.name in taken:
+            raise UsageError(f"metric {said!r}: there is a figure named {figure.name!r} already; choose another name")
+        taken.add(figure.name)
+    return found
+
+
+def measured(chosen: Iterable[str | MetricFunction], of: Of, thing: Any) -> dict[str, float]:
+    """What the chosen metrics of an episode or of a rollout give, by the figures' names.
+
+    Raises:
+        UsageError: as `find_metrics`, or a metric gives no finite number.
+    """
+    values = {}
+    for function in find_metrics(tuple(chosen)):
+        if function.of == of:
+            value = function(thing)
+            if not isinstance(value, Real) or not math.isfinite(value):
+                raise UsageError(f"metric {function.figure.name!r}: expected one finite number, got {value!r}")
+            values[function.figure.name] = float(value)
+    return values
+
+
+def figures(chosen: Sequence[str | MetricFunction] = ()) -> dict[str, Figure]:
+    """All figures by name: the suite's, those that other distributions register, and those of the chosen metrics.
+
+    A registered metric that cannot be imported is left out: what it measured is then shown by its key.
+
+    Args:
+        chosen: metrics, for those that are named by `module:function` or given as they are.
+    """
+    found = []
+    for name in plugins.names("avp.metrics", ()):
+        with suppress(UsageError):
+            found += find_metrics((name,))
+    return FIGURES | {function.figure.name: function.figure for function in [*found, *find_metrics(tuple(chosen))]}
+
+
+def figure_of(name: str) -> Figure:
+    """How a figure is called and shown; one that nobody registers, by its key."""
+    return figures().get(name) or Figure(name, name.replace("_", " "), digits=3)
 
 
 def coverage(observed: NDArray[np.bool_], navigable: NDArray[np.bool_]) -> float:

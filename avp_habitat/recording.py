@@ -1,11 +1,12 @@
 """Recording the episodes of any program that steps `AVP-v0` as rollout folders."""
 
+import multiprocessing
 import os
 import sys
 import weakref
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NoReturn, SupportsFloat
+from typing import Any, SupportsFloat
 
 import gymnasium
 
@@ -14,54 +15,6 @@ from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout.capture import VIEWS, capture_heldout, capture_step, publish_rollout
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.task.env import AVPEnv
-from avp_habitat.task.observations import action_space, observation_space
-from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
-
-_WORKERS = "stable_baselines3.common.vec_env.subproc_vec_env"
-
-
-def in_sb3_worker() -> bool:
-    """Whether a worker of `SubprocVecEnv` is among the callers."""
-    frame = sys._getframe()
-    while frame is not None:
-        if frame.f_code.co_name == "_worker" and frame.f_globals.get("__name__") == _WORKERS:
-            return True
-        frame = frame.f_back
-    return False
-
-
-class UnopenedEnv(gymnasium.Env):
-    """An environment without a scene, which can only tell why."""
-
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 - gymnasium's own declaration
-
-    def __init__(self, error: AVPError, **options: Any) -> None:
-        """Keep the error.
-
-        Args:
-            error: that opening the scene ended in.
-            **options: of the `AVPEnv` that could not be made.
-        """
-        self.failure = (type(error).__name__, str(error))
-        """Name of the error's class, and its text."""
-        self.render_mode = options.get("render_mode")
-        settings = options.get("settings") or TaskSettings()
-        kind = options.get("observation", settings.observation)
-        self.observation_space = observation_space(kind if kind in OBSERVATION_NAMES else OBSERVATION_NAMES[0])
-        self.action_space = action_space()
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> NoReturn:
-        """End the process.
-
-        Raises:
-            SystemExit: always, with the error's text, which Python prints as one line.
-        """
-        raise SystemExit(f"error: {self.failure[1]}")
-
-    def step(self, action: Any) -> NoReturn:
-        """As `reset`."""
-        self.reset()
-
 
 _PICTURE = (640, 480)
 
@@ -180,7 +133,8 @@ def make_env(*, record: str | Path | None = None, record_options: dict[str, Any]
     Raises:
         UsageError: as `AVPEnv` and `RecordRollout`, or options for a recording without a folder.
         SceneError: as `AVPEnv`.
-        SimulatorError: as `AVPEnv`. In a worker of `SubprocVecEnv` all errors wait in an `UnopenedEnv`.
+        SimulatorError: as `AVPEnv`.
+        SystemExit: instead of these in a worker of SB3's `SubprocVecEnv`, which then ends with one line.
     """
     try:
         if record is None and record_options:
@@ -188,9 +142,10 @@ def make_env(*, record: str | Path | None = None, record_options: dict[str, Any]
         env = AVPEnv(**kwargs)
         return env if record is None else RecordRollout(env, record, **(record_options or {}))
     except AVPError as error:
-        if not in_sb3_worker():
-            raise
-        return UnopenedEnv(error, **kwargs)
+        worker = getattr(multiprocessing.current_process(), "_target", None)
+        if getattr(worker, "__module__", None) == "stable_baselines3.common.vec_env.subproc_vec_env":
+            raise SystemExit(f"error: {error}") from None
+        raise
 
 
 # Gymnasium reads the render modes from the entry point.

@@ -1,21 +1,22 @@
 """`python -m avp_nerfstudio.camera_path`: a rollout's walk as a smooth camera path for `ns-render camera-path`."""
 
-import argparse
 import json
 import math
 import shlex
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tyro.conf import Positional
 
 from avp_habitat import command
 from avp_habitat.errors import RolloutError, UsageError
+from avp_habitat.files import atomic_file
 from avp_habitat.poses import camera_to_world, y_up_to_z_up, yaw_and_pitch
+from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.format import read_rollout
 
 Float = NDArray[np.floating]
@@ -28,19 +29,31 @@ _SMOOTHING_STEPS = 1.5
 
 
 @dataclass(frozen=True)
-class Film:
-    """What the film through the room is to be like."""
+class CameraPath:
+    """Write a smooth camera path along a rollout's walk, for `ns-render camera-path`."""
 
-    seconds: float = 8.0
-    """Its length."""
-    fps: int = 24
+    rollout: Positional[Path]
+    """The rollout's folder."""
+    out: Path
+    """The JSON file to write; must not exist."""
+    seconds: Annotated[float, Range(0, 3600)] = 8.0
+    """Length of the film."""
+    fps: Annotated[int, Range(1, 240)] = 24
     """Pictures per second."""
-    width: int = 640
-    """Of the pictures, in pixels."""
-    height: int = 480
-    """Of the pictures, in pixels; their vertical field of view is that of the rollout's pictures."""
-    scale: float = 1.0
-    """What avp-data multiplied all positions by; 1 unless the reconstruction was made with its `--scale`."""
+    width: Annotated[int, Range(8, 8192)] = 640
+    """Of the pictures in pixels."""
+    height: Annotated[int, Range(8, 8192)] = 480
+    """Of the pictures in pixels; their vertical field of view is that of the rollout's pictures."""
+    scale: Annotated[float, Range(1e-6, 10**6)] = 1.0
+    """avp-data's --scale, where it was used."""
+
+    def __post_init__(self) -> None:
+        """Hold the ranges."""
+        hold_ranges(self)
+        if self.frames < 2:
+            raise UsageError(
+                f"seconds: expected at least two pictures' worth, got {self.seconds:g} at {self.fps} pictures a second"
+            )
 
     @property
     def frames(self) -> int:
@@ -48,7 +61,7 @@ class Film:
         return round(self.seconds * self.fps)
 
 
-def camera_path(folder: str | Path, film: Film) -> dict[str, Any]:
+def camera_path(film: CameraPath) -> dict[str, Any]:
     """A rollout's walk in the form in which nerfstudio's viewer saves a path.
 
     Returns:
@@ -58,7 +71,7 @@ def camera_path(folder: str | Path, film: Film) -> dict[str, Any]:
     Raises:
         RolloutError: the rollout cannot be read, or its camera never moves.
     """
-    rollout = read_rollout(folder)
+    rollout = read_rollout(film.rollout)
     poses = smooth_path(np.stack([view.camera_to_world for view in rollout.frames] or [np.eye(4)]), film.frames)
     if poses is None:
         raise RolloutError(
@@ -127,56 +140,12 @@ def _smooth(track: Float) -> Float:
     return np.column_stack([np.convolve(column, weights / weights.sum(), mode="valid") for column in padded.T])
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m avp_nerfstudio.camera_path",
-        description="Write a smooth camera path along a rollout's walk, for `ns-render camera-path`.",
-    )
-    add = parser.add_argument
-    add("rollout", metavar="ROLLOUT", type=Path, help="the rollout's folder")
-    add("--out", required=True, type=Path, metavar="PATH.json", help="the file to write; must not exist")
-    add("--seconds", default=Film.seconds, type=float, help="length of the film (default: %(default)s)")
-    add("--fps", default=Film.fps, type=int, help="pictures per second (default: %(default)s)")
-    add("--width", default=Film.width, type=int, help="of the pictures in pixels (default: %(default)s)")
-    add("--height", default=Film.height, type=int, help="of the pictures in pixels (default: %(default)s)")
-    add("--scale", default=Film.scale, type=float, help="avp-data's --scale, where it was used (default: %(default)s)")
-    return parser
-
-
-def _film(options: argparse.Namespace) -> Film:
-    film = Film(options.seconds, options.fps, options.width, options.height, options.scale)
-    for name in ("width", "height"):
-        if not 8 <= getattr(film, name) <= 8192:
-            raise UsageError(f"--{name}: expected 8 to 8192 pixels, got {getattr(film, name)}")
-    if not 1 <= film.fps <= 240:
-        raise UsageError(f"--fps: expected 1 to 240 pictures per second, got {film.fps}")
-    if not 0 < film.seconds <= 3600 or film.frames < 2:
-        raise UsageError(
-            f"--seconds: expected at least two pictures' worth and at most an hour, got {film.seconds:g} at {film.fps} "
-            "pictures per second"
-        )
-    if not (math.isfinite(film.scale) and film.scale > 0):
-        raise UsageError(f"--scale: expected a number above 0, got {film.scale}")
-    return film
-
-
-def _write(path: Path, content: dict[str, Any]) -> None:
-    if path.exists():
-        raise UsageError(f"--out: {path} exists; name another file, or remove it first")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(content), encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"--out: expected a place to write {path}, got: {error.strerror}") from None
-
-
-def main(argv: Sequence[str]) -> None:
+def main(film: CameraPath) -> None:
     """Write one camera path; print what to run next."""
-    options = _parser().parse_args(argv)
-    film = _film(options)
-    _write(options.out, camera_path(options.rollout, film))
-    path, video = (shlex.quote(str(name)) for name in (options.out, options.out.with_suffix(".mp4")))
-    print(f"{options.out}: {film.frames} cameras, {film.seconds:g} s at {film.fps} pictures per second")
+    with atomic_file(film.out, replace=False, failure=UsageError, option="--out") as file:
+        file.write_text(json.dumps(camera_path(film)), encoding="utf-8")
+    path, video = (shlex.quote(str(name)) for name in (film.out, film.out.with_suffix(".mp4")))
+    print(f"{film.out}: {film.frames} cameras, {film.seconds:g} s at {film.fps} pictures per second")
     print(f"render:  ns-render camera-path --load-config CONFIG --camera-path-filename {path} --output-path {video}")
     print("         CONFIG is the config.yml of the reconstruction; --rendered-output-names rgb depth adds depth")
 

@@ -1,63 +1,40 @@
 """The objects that nerfstudio's entry points name.
 
-nerfstudio loads them unguarded at the start of every `ns-` command: a part that fails here is reported and left out, so
-that it cannot take the user's other methods with it. They are made when asked for, because nerfstudio asks for the
-dataparser while the modules that the method needs are still half imported.
+nerfstudio loads this module at the start of every `ns-` command, so what is to be done in each of them is done here.
+The objects are made when asked for, because nerfstudio asks for the dataparser while the modules that the method needs
+are still half imported.
 """
 
 import atexit
 import functools
-import logging
+import importlib
+import importlib.abc
+import importlib.machinery
 import os
 import shutil
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+from nerfstudio.utils import install_checks
 
-@functools.cache
-def offer_ffmpeg() -> None:
-    """Let nerfstudio's own check for ffmpeg find the one of imageio-ffmpeg, where there is no other.
+from avp_nerfstudio.method.checkpoints import allow_checkpoints
 
-    nerfstudio 1.1.5 looks for a program named `ffmpeg` on the PATH and ends `ns-render` when there is none, although
-    pip cannot install such a program. Nothing happens before that check runs.
-    """
-    from nerfstudio.utils import install_checks
-
-    check = install_checks.check_ffmpeg_installed
-
-    @functools.wraps(check)
-    def check_ffmpeg_installed() -> None:
-        put_ffmpeg_on_path()
-        check()
-
-    install_checks.check_ffmpeg_installed = check_ffmpeg_installed
-
-
-def put_ffmpeg_on_path() -> None:
-    """Append a folder with imageio-ffmpeg's program, under the name `ffmpeg`, to this process's PATH.
-
-    An ffmpeg that is on the PATH already stays the one in use. The folder is removed when the process ends.
-    """
-    if shutil.which("ffmpeg") is not None:
-        return
-    try:
-        from imageio_ffmpeg import get_ffmpeg_exe
-
-        program = Path(get_ffmpeg_exe()).resolve()
-    except (ImportError, RuntimeError):
-        return  # nerfstudio's own check comes next, and says that there is no ffmpeg and where to get it
-    folder = Path(tempfile.mkdtemp(prefix="avp-ffmpeg-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    (folder / "ffmpeg").symlink_to(program)
-    os.environ["PATH"] = os.pathsep.join([*filter(None, [os.environ.get("PATH")]), str(folder)])
-
-
-_LOGGER = logging.getLogger(__name__)
+MOVED = {
+    f"avp_nerfstudio.{old}": f"avp_nerfstudio.{new}"
+    for old, new in {
+        "config": "method.config",
+        "dataparser": "data.dataparser",
+        "dataset": "data.dataparser",
+        "model": "method.model",
+        "trainer": "method.trainer",
+    }.items()
+}
+"""Modules that a config.yml of a training made before they moved names, and where their objects are now."""
 # What nerfstudio 1.1.5 makes the torch of today say at every command, none of which its users can change.
 _HARMLESS: tuple[tuple[str, type[Warning]], ...] = (
     (r"`torch\.jit\.script` is deprecated", FutureWarning),
@@ -70,17 +47,44 @@ _HARMLESS: tuple[tuple[str, type[Warning]], ...] = (
 )
 
 
-@dataclass(frozen=True)
-class Unavailable:
-    """Stands in for a plug that could not be made; nerfstudio prints it in its own warning and goes on."""
+class MovedModules(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Lets the old names of `MOVED` be imported: each gives the module that has its objects now."""
 
-    plug: str
-    """Name on the command line."""
-    reason: str
-    """What failed, and what to do."""
+    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
+        """This loader, for the old names."""
+        return importlib.machinery.ModuleSpec(fullname, self) if fullname in MOVED else None
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Put the new module in the place of the old one."""
+        sys.modules[module.__name__] = importlib.import_module(MOVED[module.__name__])
 
 
-def _data() -> Any:
+def _offer_ffmpeg() -> None:
+    """Let nerfstudio's check for a program named `ffmpeg` find that of imageio-ffmpeg where the PATH has none.
+
+    nerfstudio 1.1.5 ends `ns-render` otherwise, although pip cannot install such a program.
+    """
+    check = install_checks.check_ffmpeg_installed
+
+    def check_ffmpeg_installed() -> None:
+        if shutil.which("ffmpeg") is None:
+            from imageio_ffmpeg import get_ffmpeg_exe
+
+            folder = Path(tempfile.mkdtemp(prefix="avp-ffmpeg-"))
+            atexit.register(shutil.rmtree, folder, ignore_errors=True)
+            (folder / "ffmpeg").symlink_to(Path(get_ffmpeg_exe()).resolve())
+            os.environ["PATH"] = os.pathsep.join([*filter(None, [os.environ.get("PATH")]), str(folder)])
+        check()
+
+    install_checks.check_ffmpeg_installed = check_ffmpeg_installed
+
+
+@functools.cache
+def _made(name: str) -> Any:
+    if name == "AVPNerfacto":
+        from avp_nerfstudio.method.config import avp_nerfacto
+
+        return avp_nerfacto()
     from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
     from avp_nerfstudio.data.dataparser import AVPDataParserConfig
@@ -90,63 +94,15 @@ def _data() -> Any:
     )
 
 
-def _nerfacto() -> Any:
-    from avp_nerfstudio.method.config import avp_nerfacto
-
-    return avp_nerfacto()
-
-
-def _checkpoints() -> None:
-    from avp_nerfstudio.method.checkpoints import allow_checkpoints, refuse_in_one_line
-
-    allow_checkpoints()
-    refuse_in_one_line()
-
-
-def _videos() -> None:
-    pass
-
-    offer_ffmpeg()
-
-
-def _quiet() -> None:
-    """Leave out known harmless warnings, unless warnings were asked for (`python -W`, `PYTHONWARNINGS`)."""
-    if not sys.warnoptions:
-        for message, category in _HARMLESS:
-            warnings.filterwarnings("ignore", message, category)
-
-
-_PLUGS: dict[str, tuple[str, Callable[[], Any]]] = {
-    "AVPData": ("avp-data", _data),
-    "AVPNerfacto": ("avp-nerfacto", _nerfacto),
-}
-
-
-def _guarded(plug: str, make: Callable[[], Any]) -> Any:
-    try:
-        return make()
-    except Exception as error:
-        unavailable = Unavailable(
-            plug,
-            f"{type(error).__name__}: {error}; the AVP suite is made for nerfstudio 1.1.5: "
-            'reinstall both with pip install "avp-suite[nerfstudio]"',
-        )
-        _LOGGER.warning("%s is not available: %s", plug, unavailable.reason, exc_info=error)
-        return unavailable
-
-
-@functools.cache
-def _made(name: str) -> Any:
-    plug, make = _PLUGS[name]
-    return _guarded(plug, make)
-
-
 def __getattr__(name: str) -> Any:
-    if name not in _PLUGS:
+    if name not in ("AVPData", "AVPNerfacto"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return _made(name)
 
 
-_guarded("quiet", _quiet)
-_guarded("loading of checkpoints", _checkpoints)
-_guarded("writing of videos", _videos)
+sys.meta_path.append(MovedModules())
+allow_checkpoints()
+_offer_ffmpeg()
+if not sys.warnoptions:  # `python -W`, PYTHONWARNINGS ask for warnings
+    for _message, _category in _HARMLESS:
+        warnings.filterwarnings("ignore", _message, _category)

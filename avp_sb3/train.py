@@ -1,106 +1,130 @@
-"""Train a viewpoint policy with Stable-Baselines3's PPO and the suite's callbacks."""
+"""`python -m avp_sb3.train`: train a viewpoint policy with Stable-Baselines3's PPO and the suite's callbacks."""
 
-import argparse
 import shlex
 import sys
 import tempfile
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from tyro.conf import arg
 
 from avp_habitat import command
-from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.errors import UsageError
 from avp_habitat.files import check_writable
+from avp_habitat.metrics import METRICS_HELP
 from avp_habitat.policies.registry import TRUSTED, load_model
 from avp_habitat.policies.saved_model import is_normalised, load_statistics, statistics_of
+from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.simulators.registry import ONE_PER_PROCESS, SimulatorChoice, add_simulator_options, simulator_choice
-from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
-from avp_sb3.presets import PRESETS, Preset
+from avp_habitat.simulators.registry import SimulatorChoice
+from avp_habitat.task.rewards import REWARDS_HELP
+from avp_habitat.task.settings import OBSERVATIONS_HELP, TaskSettings
+from avp_habitat.tracking.experiments import DEFAULT_HELP
+from avp_sb3.presets import MAP, PRESETS, Preset
 
 _MLFLOW = "runs:/"
-_STATISTICS = "_vecnormalize.pkl"
+_MOST = 1e12
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=f"{__doc__} 300,000 steps of 64 agents take about a minute on two CPU cores with the numbers.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    add = parser.add_argument
-    add("--scene", default=["builtin:0"], nargs="+", help=f"{SCENES}; agents share several")
-    add("--reward", default="proposed", help="coverage, coverage_redundancy, proposed or surface")
-    add("--observation", default="numbers", help="numbers (the paper's twelve), map or surface_map; also chooses PPO's")
-    add("--steps", default=300_000, type=int, help="environment steps in total")
-    add("--agents", default=None, type=int, help="agents stepped as one batch; the settings' own when omitted")
-    add("--workers", default=None, type=int, help="processes with a simulator each, a multiple of the scenes' number")
-    add_simulator_options(parser)
-    add("--rays", action="store_true", help="cast all rays instead of looking views up in the scenes' tables")
-    add("--width", default=160, type=int, help="of the policy's depth image in pixels")
-    add("--height", default=120, type=int, help="of the policy's depth image in pixels")
-    add("--seed", default=0, type=int, help="of the policy and the starts")
-    add("--out", default=Path("runs/ppo.zip"), type=Path, help="the model; also written after Ctrl-C")
-    add(
-        "--resume",
-        default=None,
-        metavar="MODEL",
-        help="go on until --steps are done with a model: a file, or MLflow's runs:/RUN_ID/model.zip",
-    )
-    add("--trusted", action="store_true", help=TRUSTED)
-    add("--eval-scene", default=None, nargs="+", metavar="SCENE", help="evaluate in these too, and keep the best model")
-    add("--eval-every", default=150_000, type=int, help="environment steps between two evaluations")
-    add("--recording", default=None, type=Path, help="the Rerun recording (.rrd) of some episodes; none when omitted")
-    add("--experiment", default=None, help="of MLflow (default: MLFLOW_EXPERIMENT_NAME, else avp)")
-    add("--run-name", default=None, help="of the MLflow run")
-    return parser
+@dataclass(frozen=True)
+class Train:
+    """Train a viewpoint policy with Stable-Baselines3's PPO and the suite's callbacks.
+
+    300,000 steps of 64 agents take about a minute on two CPU cores with the numbers.
+    """
+
+    scene: Annotated[tuple[str, ...], arg(help=f"{SCENES}; agents share several")] = ("builtin:0",)
+    reward: Annotated[str, arg(help=REWARDS_HELP)] = "proposed"
+    observation: Annotated[str, arg(help=f"{OBSERVATIONS_HELP}; also chooses PPO's settings")] = "numbers"
+    metrics: Annotated[tuple[str, ...], arg(help=METRICS_HELP)] = ()
+    steps: Annotated[int, Range(1, _MOST)] = 300_000
+    """Environment steps in total."""
+    agents: int | None = None
+    """Agents stepped as one batch (omitted: the settings' own)."""
+    workers: int | None = None
+    """Processes with a simulator each, a multiple of the scenes' number."""
+    simulator: SimulatorChoice = field(default_factory=SimulatorChoice)
+    """Which simulator opens the scenes."""
+    rays: bool = False
+    """Cast all rays instead of looking views up in the scenes' tables."""
+    width: int = 160
+    """Of the policy's depth image in pixels."""
+    height: int = 120
+    """Of the policy's depth image in pixels."""
+    seed: int = 0
+    """Of the policy and the starts."""
+    out: Path = Path("runs/ppo.zip")
+    """The model; also written after Ctrl-C."""
+    resume: Annotated[str | None, arg(metavar="MODEL")] = None
+    """Go on until --steps are done with a model: a file, or MLflow's runs:/RUN_ID/model.zip."""
+    trusted: Annotated[bool, arg(help=TRUSTED)] = False
+    eval_scene: Annotated[tuple[str, ...] | None, arg(metavar="SCENE")] = None
+    """Evaluate in these too, and keep the best model."""
+    eval_every: Annotated[int, Range(1, _MOST)] = 150_000
+    """Environment steps between two evaluations."""
+    recording: Path | None = None
+    """The Rerun recording (.rrd) of some episodes; none when omitted."""
+    experiment: Annotated[str | None, arg(help=f"MLflow's (omitted: {DEFAULT_HELP})")] = None
+    run_name: str | None = None
+    """Of the MLflow run (omitted: algorithm, reward, scene and seed)."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be right."""
+        hold_ranges(self)
+        _ = self.settings, self.preset
+
+    @property
+    def preset(self) -> Preset:
+        """PPO's settings; the buffer is shared by as many agents as asked for."""
+        preset = PRESETS.get(self.observation, MAP)
+        buffer = preset.n_envs * preset.n_steps
+        agents = preset.n_envs if self.agents is None else self.agents
+        if agents < 1 or buffer % agents:
+            raise UsageError(f"agents: expected a divisor of PPO's buffer of {buffer} steps, got {agents}")
+        return replace(preset, n_envs=agents, n_steps=buffer // agents)
+
+    @property
+    def settings(self) -> TaskSettings:
+        """Of the task."""
+        return TaskSettings(
+            reward=self.reward,
+            observation=self.observation,
+            metrics=self.metrics,
+            lookup=not self.rays and self.simulator.single_rays,
+            width=self.width,
+            height=self.height,
+        )
 
 
-def _preset(options: argparse.Namespace) -> Preset:
-    """PPO's settings; the buffer is shared by as many agents as asked for."""
-    if options.observation not in OBSERVATION_NAMES:
-        raise unknown_name("observation", options.observation, OBSERVATION_NAMES)
-    if options.steps < 1:
-        raise UsageError(f"--steps: expected at least 1, got {options.steps}")
-    if options.eval_every < 1:
-        raise UsageError(f"--eval-every: expected at least 1, got {options.eval_every}")
-    preset = PRESETS[options.observation]
-    buffer = preset.n_envs * preset.n_steps
-    agents = preset.n_envs if options.agents is None else options.agents
-    if agents < 1 or buffer % agents:
-        raise UsageError(f"--agents: expected a divisor of PPO's buffer of {buffer} steps, got {agents}")
-    return replace(preset, n_envs=agents, n_steps=buffer // agents)
-
-
-def _environment(options: argparse.Namespace, preset: Preset, choice: SimulatorChoice) -> Any:
+def _environment(options: Train) -> Any:
     """The agents in this process, or in several: when asked for, and where each scene needs its own simulator."""
     from stable_baselines3.common.vec_env import VecMonitor
 
     from avp_sb3 import AVPSubprocVecEnv, AVPVecEnv
 
-    settings = TaskSettings(
-        reward=options.reward,
-        observation=options.observation,
-        lookup=not options.rays and choice.simulator == "raycast",
-        width=options.width,
-        height=options.height,
-    )
-    common = {"agents": preset.n_envs, "settings": settings, "seed": options.seed}
-    common |= {"simulator": choice.simulator, "gpu": choice.gpu, "navmesh": choice.navmesh, "up": choice.up}
-    if options.workers is None and (len(options.scene) == 1 or choice.simulator not in ONE_PER_PROCESS):
-        return VecMonitor(AVPVecEnv(options.scene, **common))
-    return VecMonitor(AVPSubprocVecEnv(options.scene, workers=options.workers, **common))
+    choice, scenes = options.simulator, list(options.scene)
+    common = {"agents": options.preset.n_envs, "settings": options.settings, "seed": options.seed, **vars(choice)}
+    if options.workers is None and (len(scenes) == 1 or not choice.one_per_process):
+        return VecMonitor(AVPVecEnv(scenes, **common))
+    return VecMonitor(AVPSubprocVecEnv(scenes, workers=options.workers, **common))
 
 
-def _model(options: argparse.Namespace, preset: Preset, env: Any) -> Any:
+def _model(options: Train, env: Any) -> Any:
     if options.resume is None:
+        from gymnasium import spaces
         from stable_baselines3 import PPO
 
-        return PPO("MlpPolicy", env, device="cpu", seed=options.seed, **preset.arguments())
+        policy = "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy"
+        return PPO(policy, env, device="cpu", seed=options.seed, **options.preset.arguments())
     with tempfile.TemporaryDirectory() as folder:
         path = _resumed_file(options.resume, folder)
+        if (statistics := statistics_of(path)) is not None:
+            normalised = load_statistics(statistics, env.observation_space, trusted=options.trusted)
+            normalised.set_venv(env)
+            env = normalised
         try:
-            model = load_model(path, env=_normalised(path, env, options.trusted), trusted=options.trusted)
+            model = load_model(path, env=env, trusted=options.trusted)
         except ValueError as error:
             raise UsageError(f"--resume {options.resume}: does not fit these options: {error}") from None
     if model.num_timesteps >= options.steps:
@@ -108,17 +132,8 @@ def _model(options: argparse.Namespace, preset: Preset, env: Any) -> Any:
     return model
 
 
-def _normalised(path: Path, env: Any, trusted: bool) -> Any:
-    """The environment as the model's training had it: under `VecNormalize` with its statistics, or as it is."""
-    statistics = statistics_of(path)
-    if statistics is None:
-        return env
-    normalised = load_statistics(statistics, env.observation_space, trusted=trusted)
-    normalised.set_venv(env)
-    return normalised
-
-
 def _resumed_file(resume: str, folder: str) -> Path:
+    """The model's file, of which MLflow's copy comes into the folder, with its statistics beside it."""
     if not resume.startswith(_MLFLOW):
         if not Path(resume).is_file():
             raise UsageError(f"--resume {resume}: no such model file")
@@ -133,30 +148,30 @@ def _resumed_file(resume: str, folder: str) -> Path:
     if is_missing(address):
         raise UsageError(f"--resume {resume}: no MLflow database at {shown(address)}; set MLFLOW_TRACKING_URI")
     try:
-        found = download_artifacts(artifact_uri=resume, dst_path=folder, tracking_uri=address)
+        found = Path(download_artifacts(artifact_uri=resume, dst_path=folder, tracking_uri=address))
     except (MlflowException, OSError) as error:
         raise UsageError(f"--resume {resume}: not found at {shown(address)}: {first_line(error)}") from None
-    if not Path(found).is_file():
+    if not found.is_file():
         raise UsageError(f"--resume {resume}: expected a model file, found a folder; add /model.zip")
-    if is_normalised(Path(found)):
-        beside = resume.removesuffix(".zip") + _STATISTICS
+    if is_normalised(found):
+        beside = f"{resume.removesuffix('.zip')}_vecnormalize.pkl"
         try:
             download_artifacts(artifact_uri=beside, dst_path=folder, tracking_uri=address)
         except (MlflowException, OSError):
             raise UsageError(
                 f"--resume {resume}: trained under VecNormalize, but its statistics {beside} are not with the run"
             ) from None
-    return Path(found)
+    return found
 
 
-def _callbacks(options: argparse.Namespace, choice: SimulatorChoice, tracking: Any) -> list[Any]:
+def _callbacks(options: Train, tracking: Any) -> list[Any]:
     from avp_sb3 import EvaluationCallback, MetricsCallback, RerunCallback
 
     callbacks: list[Any] = []
     # First, so that scenes that cannot be opened leave no empty run behind.
     if options.eval_scene is not None:
         best = options.out.with_stem(f"{options.out.stem}-best")
-        where = {"simulator": choice.simulator, "gpu": choice.gpu, "up": choice.up}
+        where: dict[str, Any] = vars(options.simulator) | {"navmesh": None}  # That is the training scene's.
         callbacks.append(EvaluationCallback(options.eval_scene, every=options.eval_every, best_model=best, **where))
     callbacks += [MetricsCallback(), tracking]
     if options.recording is not None:
@@ -164,11 +179,8 @@ def _callbacks(options: argparse.Namespace, choice: SimulatorChoice, tracking: A
     return callbacks
 
 
-def main(argv: Sequence[str]) -> None:
+def main(options: Train) -> None:
     """Train, track and save."""
-    options = _parser().parse_args(argv)
-    preset = _preset(options)
-    choice = simulator_choice(options)
     check_writable(options.out)
     print(f"opening {', '.join(options.scene)} …", flush=True)
 
@@ -180,11 +192,10 @@ def main(argv: Sequence[str]) -> None:
 
     # The policy is a small network: more threads of torch only wait for each other.
     torch.set_num_threads(1)
-    env = _environment(options, preset, choice)
-    model = _model(options, preset, env)
+    env = _environment(options)
+    model = _model(options, env)
     tracking = MLflowCallback(options.experiment, run_name=options.run_name)
-    callbacks = _callbacks(options, choice, tracking)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
+    callbacks = _callbacks(options, tracking)
     begun = model.num_timesteps
     done = False
     try:
@@ -199,7 +210,7 @@ def main(argv: Sequence[str]) -> None:
             save_model(model, options.out)
             print(f"{options.out}: the policy after {model.num_timesteps} steps; MLflow run {tracking.run_id}")
             if not done:
-                again = shlex.join(["python", "-m", "avp_sb3.train", *argv, "--resume", str(options.out)])
+                again = shlex.join(["python", "-m", "avp_sb3.train", *sys.argv[1:], "--resume", str(options.out)])
                 print(f"to go on:  {again}")
         env.close()
 

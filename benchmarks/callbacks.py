@@ -28,7 +28,7 @@ from tqdm import tqdm
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.task.rewards import check_reward
+from avp_habitat.task.rewards import find_reward
 from avp_sb3.presets import TABLE_4
 
 _BUFFER = TABLE_4.n_envs * TABLE_4.n_steps
@@ -70,7 +70,7 @@ def main(argv: Sequence[str]) -> None:
     reporting.check_least(options, agents=1, repeats=1, steps=1, delay_steps=1, episodes=1, seed=0)
     if _BUFFER % options.agents:
         raise UsageError(f"--agents: expected a divisor of {_BUFFER}, got {options.agents}")
-    check_reward(options.reward)
+    find_reward(options.reward)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with reporting.own_folders(folder), reporting.reported("callbacks", options) as results:
@@ -143,16 +143,17 @@ class _Bench:
 
     def first_evaluation(self) -> dict[str, Any]:
         """CPU seconds of the default evaluation: opening its scene, the first time in it, and later ones."""
+        from avp_sb3 import AVPVecEnv
         from avp_sb3.callbacks.evaluation import DEFAULT_EPISODES, DEFAULT_EVERY, DEFAULT_SCENES
-        from avp_sb3.evaluation.batch import FixedStarts, run_batch
+        from avp_sb3.evaluation.batch import run_batch
 
         model, seconds = self.model(self.options.seed), []
         start = time.process_time()
-        env = FixedStarts(DEFAULT_SCENES, episodes=DEFAULT_EPISODES, simulator="raycast", settings=self.settings)
+        env = AVPVecEnv(DEFAULT_SCENES, agents=DEFAULT_EPISODES * len(DEFAULT_SCENES), settings=self.settings)
         open_s = time.process_time() - start
         for _ in range(6):
             start = time.process_time()
-            run_batch(model, env, dict.fromkeys(range(env.num_envs), 1), seed=1000, deterministic=False)
+            run_batch(model, env, DEFAULT_EPISODES, seed=1000, deterministic=False)
             seconds.append(time.process_time() - start)
         return {
             "scenes": ", ".join(DEFAULT_SCENES),

@@ -174,8 +174,8 @@ def _train(config: Any, clock_of: Callable[[], Clock]) -> tuple[Any, Clock]:
 
 def _score(trainer: Any, pictures: Path, views: Sequence[int], every: int) -> list[dict[str, Any]]:
     from avp_habitat.rollout.images import write_rgb
-    from avp_nerfstudio.data.heldout import render_views, to_8_bit
     from avp_nerfstudio.method.hash_encoding import compile_hash_encodings
+    from avp_nerfstudio.method.scores import render_views, to_8_bit
 
     trainer.pipeline.eval()
     # The compiled encoding gives the same colours (a test holds it to that), several times as fast.

@@ -25,8 +25,8 @@ from tqdm import tqdm
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.sight.rows import ENVIRONMENT as CACHE
-from avp_habitat.task.rewards import check_reward
+from avp_habitat.sight.lattice import CACHE_VARIABLE as CACHE
+from avp_habitat.task.rewards import find_reward
 from avp_sb3.presets import TABLE_4
 
 _BUFFER = TABLE_4.n_envs * TABLE_4.n_steps
@@ -60,7 +60,7 @@ def main(argv: Sequence[str]) -> None:
     for agents in [options.agents, *options.memory_agents]:
         if agents < 1 or _BUFFER % agents:
             raise UsageError(f"--agents, --memory-agents: expected divisors of {_BUFFER}, got {agents}")
-    check_reward(options.reward)
+    find_reward(options.reward)
     with tempfile.TemporaryDirectory() as name, reporting.reported("training", options) as results:
         folder = Path(name)
         with reporting.own_folders(folder):

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pose_faults import FAULTS, MORE_FAULTS, SMALL_FAULTS, damaged, write_faulty
 from scipy.stats import beta
 
 from avp_habitat import command
@@ -34,7 +35,6 @@ from avp_habitat.provenance import installed_versions
 from avp_habitat.rollout.format import Rollout
 from avp_habitat.task.settings import TaskSettings
 from avp_nerfstudio.check.depth_maps import DepthMaps, load_depth_maps
-from avp_nerfstudio.check.faults import FAULTS, MORE_FAULTS, SMALL_FAULTS, damaged, write_faulty
 from avp_nerfstudio.check.geometry import check_geometry
 from avp_nerfstudio.check.pictures.evidence import judge
 from avp_nerfstudio.check.pictures.matching import Matches, match_pictures

@@ -1,28 +1,31 @@
 """Train every configuration of the training results with several seeds, evaluate all, and write tables and pictures.
 
-What is done is not done again: interrupted and started once more, it goes on with what is missing.
+What is done is not done again: interrupted and started once more, it goes on with what is missing. Tables and pictures
+are made from what the results' folder holds: `episodes.csv` (figures of each episode) and `curves.json` (mean coverage
+by view).
 """
 
-import argparse
+import csv
 import itertools
 import json
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from tqdm import tqdm
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
-from avp_sb3.evaluation.policy import mean_and_half_width
+from avp_habitat.ranges import Range, hold_ranges
 
 ROOT = Path(__file__).resolve().parent.parent
 BASELINES = ("heuristic", "random", "spin", "frontier", "greedy", "oracle")
@@ -181,15 +184,15 @@ def draw_training_curves(trainings: Sequence[Trained], picture: Path) -> None:
     figure.savefig(picture, dpi=120)
 
 
-def draw_comparison(results: Sequence[Any], picture: Path) -> None:
+def draw_comparison(stored: Sequence[tuple[Any, Any]], picture: Path) -> None:
     """Mean coverage by view: baselines dashed, learned policies solid, a dot where those that stop do so on average."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 4.8), layout="constrained")
     axes = figure.subplots()
-    for result in results:
+    for result, half_width in stored:
         learned = result.policy not in BASELINES
-        mean, half = mean_and_half_width(100 * result.curve)
+        mean, half = 100 * result.curve[0], 100 * half_width
         views = np.arange(1, len(mean) + 1)
         label = f"{result.policy} ({len(result.seeds)} episodes)"
         (line,) = axes.plot(views, mean, "-" if learned else "--", linewidth=2 if learned else 1.2, label=label)
@@ -217,49 +220,99 @@ def _history(client: Any, training: Trained, metric: str) -> tuple[list[int], li
     return [step for step, _ in points], [value for _, value in points]
 
 
-def write_results(options: argparse.Namespace, trainings: Sequence[Trained], argv: Sequence[str]) -> None:
-    """Tables, JSON, and pictures in the results' folder."""
-    from avp_sb3.evaluation.report import read_report, table, write_report
+def store(folder: Path, results: Sequence[Any], about: dict[str, Any]) -> None:
+    """Write what tables and pictures need of a scene's evaluations: `episodes.csv` and `curves.json`."""
+    from avp_sb3.evaluation.report import write_report
 
-    about = {"command": shlex.join(["python", "scripts/training_results.py", *argv]), "seed": FIRST_SEED}
-    out: Path = options.out
-    out.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    write_report(folder, results, about)
+    shorten(folder)
+
+
+def shorten(folder: Path) -> None:
+    """Replace a report's `evaluation.json`, which has every view of every episode, by the mean curves in it."""
+    path = folder / "evaluation.json"
+    known = json.loads(path.read_text(encoding="utf-8"))
+    rows = [
+        {name: one[name] for name in ("policy", "observation", "training_run")}
+        | {name: [float(f"{value:.6g}") for value in values] for name, values in one["curve"].items()}
+        for one in known.pop("policies")
+    ]
+    lines = ",\n".join(json.dumps(row) for row in rows)
+    text = f'{{"about": {json.dumps(known)},\n"policies": [\n{lines}\n]}}\n'
+    (folder / "curves.json").write_text(text, encoding="utf-8")
+    path.unlink()
+
+
+def read_stored(folder: Path) -> list[tuple[Any, Any]]:
+    """By policy: its result with the mean curve `(1, views)` in place of each episode's, and the curve's half width."""
+    from avp_sb3.evaluation.policy import PolicyResult
+
+    with (folder / "episodes.csv").open(newline="", encoding="utf-8") as file:
+        episodes = list(csv.DictReader(file))
+    found = []
+    for row in json.loads((folder / "curves.json").read_text(encoding="utf-8"))["policies"]:
+        mine = [episode for episode in episodes if episode["policy"] == row["policy"]]
+        seeds = np.array([int(episode["seed"]) for episode in mine])
+        names = [name for name in episodes[0] if name not in ("policy", "seed")]
+        figures = {name: np.array([float(episode[name]) for episode in mine]) for name in names}
+        curve = np.array([row["mean"]])
+        result = PolicyResult(row["policy"], seeds, curve, figures, row["training_run"], row["observation"])
+        found.append((result, np.array(row["half_width"])))
+    return found
+
+
+def write_tables(out: Path, scenes: Sequence[str]) -> None:
+    """Tables and pictures of coverage from what is stored.
+
+    Args:
+        out: the results' folder.
+        scenes: their names.
+    """
+    from avp_sb3.evaluation.report import table
+
+    folders = {name: out / _slug(name) for name in scenes}
+    about = json.loads((folders[scenes[0]] / "curves.json").read_text(encoding="utf-8"))["about"]
     text = [
         "# Training results",
         "",
         f"Made by `{about['command']}`; seeds, commit, machine and versions: the JSON files.",
     ]
-    for scene in (options.scene, options.unseen):
-        name = Path(scene).stem.replace(":", "_")
+    for name, folder in folders.items():
+        stored = read_stored(folder)
+        (folder / "table.md").write_text(table([result for result, _ in stored]) + "\n", encoding="utf-8")
+        draw_comparison(stored, folder / "coverage.png")
+        picture = f"![coverage by view]({folder.name}/coverage.png)"
+        text += ["", f"## {name}", "", picture, "", _transposed(table([result for result, _ in stored]))]
+    text += ["", "## While training", "", "![training curves](training_curves.png)", ""]
+    (out / "README.md").write_text("\n".join(text), encoding="utf-8")
+
+
+def write_results(options: "TrainingResults", trainings: Sequence[Trained]) -> None:
+    """Everything in the results' folder, from models, evaluations and MLflow."""
+    from avp_sb3.evaluation.report import read_report
+
+    about = {"command": shlex.join(["python", "scripts/training_results.py", *sys.argv[1:]]), "seed": FIRST_SEED}
+    options.out.mkdir(parents=True, exist_ok=True)
+    for scene in options.scenes:
         results = read_report(_report(options.work, "baselines", scene))
         for _, group in itertools.groupby(trainings, key=lambda training: training.configuration):
             results.append(pooled(list(group), options.work, scene))
-        folder = out / name
-        if folder.exists():
-            for file in folder.iterdir():
-                file.unlink()
-            folder.rmdir()
-        write_report(folder, results, about | {"scene": {"name": Path(scene).name}})
-        draw_comparison(results, folder / "coverage.png")
-        text += [
-            "",
-            f"## {Path(scene).name}",
-            "",
-            f"![coverage by view]({name}/coverage.png)",
-            "",
-            _transposed(table(results)),
-        ]
-    draw_training_curves(trainings, out / "training_curves.png")
-    text += ["", "## While training", "", "![training curves](training_curves.png)", ""]
-    (out / "README.md").write_text("\n".join(text), encoding="utf-8")
-    (out / "configurations.json").write_text(
-        json.dumps([c.__dict__ for c in CONFIGURATIONS], indent=1) + "\n", encoding="utf-8"
-    )
+        store(options.out / _slug(scene), results, about | {"scene": {"name": Path(scene).name}})
+    write_tables(options.out, [Path(scene).name for scene in options.scenes])
+    draw_training_curves(trainings, options.out / "training_curves.png")
+    configurations = [asdict(configuration) for configuration in CONFIGURATIONS]
+    text = json.dumps(configurations, indent=1) + "\n"
+    (options.out / "configurations.json").write_text(text, encoding="utf-8")
+
+
+def _slug(scene: str) -> str:
+    return Path(scene).stem.replace(":", "_")
 
 
 def _report(work: Path, name: str, scene: str) -> Path:
     """The folder of an evaluation on a scene."""
-    return work / f"{name}-on-{Path(scene).stem.replace(':', '_')}"
+    return work / f"{name}-on-{_slug(scene)}"
 
 
 def _transposed(markdown: str) -> str:
@@ -270,23 +323,43 @@ def _transposed(markdown: str) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    add = parser.add_argument
-    add("--scene", default="../shared/scenes/white_room.glb", help="trained in, and evaluated on")
-    add("--unseen", default="../shared/scenes/grey_white_room.glb", help="evaluated on, never trained in")
-    add("--rooms", default=16, type=int, help="generated rooms of the configurations with many, builtin:0 upwards")
-    add("--jobs", default=2, type=int, help="trainings or evaluations at a time")
-    add("--work", default=Path("runs/training-results"), type=Path, help="models, logs and evaluations")
-    add("--out", default=Path("docs/results/training"), type=Path, help="tables and pictures")
-    add("--only", default="", help="configurations whose names contain this")
-    return parser
+@dataclass(frozen=True)
+class TrainingResults:
+    """Train every configuration of the training results with several seeds, evaluate all, write tables and pictures."""
+
+    scene: str = "../shared/scenes/white_room.glb"
+    """Trained in, and evaluated on."""
+    unseen: str = "../shared/scenes/grey_white_room.glb"
+    """Evaluated on, never trained in."""
+    rooms: int = 16
+    """Generated rooms of the configurations with many, builtin:0 upwards."""
+    jobs: Annotated[int, Range(1, 1024)] = 2
+    """Trainings or evaluations at a time."""
+    work: Path = Path("runs/training-results")
+    """Models, logs and evaluations."""
+    out: Path = Path("docs/results/training")
+    """Tables and pictures."""
+    only: str = ""
+    """Configurations whose names contain this; writes no tables."""
+    stored: bool = False
+    """Only make tables and pictures of coverage again, from what lies in --out."""
+
+    def __post_init__(self) -> None:
+        """Hold the ranges."""
+        hold_ranges(self)
+
+    @property
+    def scenes(self) -> tuple[str, str]:
+        """Evaluated on."""
+        return self.scene, self.unseen
 
 
-def main(argv: Sequence[str]) -> None:
+def main(options: TrainingResults) -> None:
     """Train, evaluate, write."""
-    options = _parser().parse_args(argv)
-    for scene in (options.scene, options.unseen):
+    if options.stored:
+        write_tables(options.out, [Path(scene).name for scene in options.scenes])
+        return
+    for scene in options.scenes:
         if not scene.startswith("builtin:") and not (ROOT / scene).is_file():
             raise UsageError(f"{scene}: no such file")
     os.environ.setdefault("MLFLOW_TRACKING_URI", f"sqlite:///{(ROOT / options.work / 'mlflow.db').resolve()}")
@@ -305,16 +378,16 @@ def main(argv: Sequence[str]) -> None:
     ]
     longest = sorted(trainings, key=lambda training: -training.configuration.steps)
     in_parallel(options.jobs, "training", [partial(training.train, options.scene, rooms) for training in longest])
-    scenes = (options.scene, options.unseen)
     tasks = [
-        partial(evaluate, scene, BASELINES, _report(options.work, "baselines", scene), "coverage") for scene in scenes
+        partial(evaluate, scene, BASELINES, _report(options.work, "baselines", scene), "coverage")
+        for scene in options.scenes
     ]
-    for scene, reward in itertools.product(scenes, sorted({t.configuration.reward for t in trainings})):
+    for scene, reward in itertools.product(options.scenes, sorted({t.configuration.reward for t in trainings})):
         models = [str(training.model) for training in trainings if training.configuration.reward == reward]
         tasks.append(partial(evaluate, scene, models, _report(options.work, reward, scene), reward))
     in_parallel(options.jobs, "evaluating", tasks)
     if not options.only:
-        write_results(options, trainings, argv)
+        write_results(options, trainings)
         print(f"{options.out}: tables and pictures")
 
 

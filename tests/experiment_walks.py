@@ -6,22 +6,20 @@ from dataclasses import replace
 from pathlib import Path
 
 from avp_experiment.cells import COLLECT, plan
-from avp_experiment.configuration import Configuration, Scene, chosen_methods
-from avp_experiment.execute import environment
-from avp_experiment.presets import PRESETS
-from avp_experiment.runner import Runner
-from avp_experiment.store import Store
+from avp_experiment.configuration import PRESETS, Configuration, Scene, chosen_methods
+from avp_experiment.folder import Folder
+from avp_experiment.runner import Runner, environment
 
 
 def rollouts(root):
     preset = replace(PRESETS["smoke"], budget=3, size=(32, 24), starts=3, prefixes=())
     scenes = (Scene("builtin:0", "builtin:0", "00", "train"),)
-    configuration = Configuration("smoke", preset, 1, scenes, chosen_methods(["heuristic", "random"]))
+    configuration = Configuration("smoke", preset, scenes, chosen_methods(["heuristic", "random"]))
     return [cell for cell in plan(configuration, root, tracking="avp") if cell.kind == COLLECT]
 
 
 def run(root, cells, jobs=1):
-    runner = Runner(Store(root), jobs, environment(f"sqlite:///{root}/mlflow.db"), ("avp_experiment.execute",))
+    runner = Runner(Folder(root), jobs, environment(f"sqlite:///{root}/mlflow.db"), ("avp_experiment.runner",))
     runner.run(cells)
     return runner
 
@@ -29,6 +27,7 @@ def run(root, cells, jobs=1):
 if __name__ == "__main__":
     folder = Path(sys.argv[1])
     chosen = rollouts(folder)
-    if len(sys.argv) > 2:  # a program to run instead of the first rollout's
-        chosen = [replace(chosen[0], words=("python", sys.argv[2]))]
+    if len(sys.argv) > 2:  # a module to run instead of the first rollout's, beside the experiment
+        sys.path.insert(0, str(folder))
+        chosen = [replace(chosen[0], words=("python", "-m", sys.argv[2]))]
     print(json.dumps(run(folder, chosen).failed))

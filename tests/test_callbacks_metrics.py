@@ -1,3 +1,4 @@
+import json
 import subprocess
 import sys
 
@@ -7,12 +8,12 @@ import pytest
 from corridor import Corridor
 from stable_baselines3 import DQN, SAC
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 from tracking import SETTINGS, SmallEnv, ppo
 
 from avp_sb3 import AVPVecEnv, MetricsCallback
-from avp_sb3.callbacks.base import MissingInfoError
+from avp_sb3.callbacks.base import MissingInfoError, record
 from avp_sb3.callbacks.metrics import EpisodeWindow
 
 EPISODE = {
@@ -127,7 +128,7 @@ def test_an_environment_without_the_figures_is_named_with_the_one_to_use():
         ppo(gymnasium.make("CartPole-v1")).learn(256, callback=MetricsCallback())
 
 
-@pytest.mark.parametrize("key", ["coverage", "views", "ei", "annd_m", "stopped", "collisions", "redundant_views"])
+@pytest.mark.parametrize("key", ["coverage", "views"])
 def test_a_missing_figure_is_named(key):
     episode = {name: value for name, value in EPISODE.items() if name != key}
     with pytest.raises(MissingInfoError, match=rf"expected '{key}' in info\['avp_episode'\]"):
@@ -195,11 +196,25 @@ def test_off_policy_algorithms_have_the_figures_too(make):
     assert dumps[0]["avp/coverage"] == pytest.approx(np.mean([each["coverage"] for each in notes.episodes[:4]]))
 
 
-def test_a_reward_part_that_disappears_is_named():
+def test_figures_and_reward_parts_of_any_name_are_recorded():
     window = EpisodeWindow(3)
     window.add(EPISODE)
-    with pytest.raises(MissingInfoError, match="expected 'return_coverage'"):
-        window.add({name: value for name, value in EPISODE.items() if name != "return_coverage"})
+    mine = {"sofas seen": 3.0, "return_sofa/blue": 5.0}
+    window.add({name: value for name, value in EPISODE.items() if name != "return_coverage"} | mine)
+    found = window.means()
+    assert found["avp/sofas seen"] == 3.0, "the first episode did not know it"
+    # A part that an episode does not have gave it nothing.
+    assert (found["reward/sofa/blue"], found["reward/coverage"]) == (2.5, 2.0)
+
+
+def test_names_that_the_screen_would_cut_to_the_same_reach_the_other_formats(tmp_path, capsys):
+    logger = configure(str(tmp_path), ["stdout", "json"])
+    for place, name in enumerate(("kitchen", "bath")):
+        record(logger, f"reward/a_part_of_the_reward_with_a_long_name_in_the_{name}", place)
+    record(logger, "reward/short", 2)
+    logger.dump()
+    assert set(json.loads((tmp_path / "progress.json").read_text()).values()) == {0, 1, 2}
+    assert "long_name" not in capsys.readouterr().out
 
 
 def test_importing_the_package_imports_no_host():

@@ -10,7 +10,7 @@ from avp_habitat.errors import RolloutError
 from avp_habitat.poses import Intrinsics, camera_to_world, rigidity_fault, y_up_to_z_up, yaw_and_pitch
 from avp_habitat.rollout.format import read_rollout
 from avp_habitat.rollout.writing import RolloutWriter
-from avp_nerfstudio.camera_path import Film, camera_path, main, smooth_path
+from avp_nerfstudio.camera_path import CameraPath, camera_path, main, smooth_path
 
 CAMERA = Intrinsics.from_hfov(32, 24, hfov_deg=80.0)
 
@@ -85,8 +85,8 @@ def test_nerfstudio_reads_the_path_as_the_dataparser_gives_the_poses(tmp_path):
 
     walk = write_walk(tmp_path / "walk", l_shaped_walk())
     for scale in (1.0, 0.5):
-        film = Film(seconds=2, fps=10, width=64, height=48, scale=scale)
-        cameras = get_path_from_json(json.loads(json.dumps(camera_path(walk, film))))
+        film = CameraPath(walk, tmp_path, seconds=2, fps=10, width=64, height=48, scale=scale)
+        cameras = get_path_from_json(json.loads(json.dumps(camera_path(film))))
         given = AVPDataParserConfig(data=walk, scale=scale).setup().get_dataparser_outputs("train").cameras
         assert len(cameras) == 20
         for index in (0, -1):
@@ -99,7 +99,7 @@ def test_nerfstudio_reads_the_path_as_the_dataparser_gives_the_poses(tmp_path):
 
 def test_another_shape_of_picture_keeps_the_vertical_field_of_view(tmp_path):
     walk = write_walk(tmp_path / "walk", l_shaped_walk())
-    path = camera_path(walk, Film(width=100, height=40))
+    path = camera_path(CameraPath(walk, tmp_path, width=100, height=40))
     assert path["camera_path"][0]["fov"] == pytest.approx(math.degrees(2 * math.atan(12 / CAMERA.fy)))
     assert path["camera_path"][0]["aspect"] == 2.5
 
@@ -123,20 +123,20 @@ def test_the_command_writes_the_path_and_prints_what_renders_it(tmp_path, capsys
 def test_a_camera_that_never_moves_has_no_path(tmp_path, poses):
     walk = write_walk(tmp_path / "walk", poses)
     with pytest.raises(RolloutError, match=rf"walk: expected frames from at least two places.*\({len(poses)} frames\)"):
-        camera_path(walk, Film())
+        camera_path(CameraPath(walk, tmp_path))
 
 
 @pytest.mark.parametrize(
     ("options", "code", "text"),
     [
         (["--seconds", "0"], 2, "--seconds: expected at least two pictures' worth"),
-        (["--seconds", "nan"], 2, "--seconds: expected"),
+        (["--seconds", "nan"], 2, "--seconds: expected a number from 0 to 3,600"),
         (["--seconds", "0.01"], 2, "--seconds: expected"),
-        (["--fps", "0"], 2, "--fps: expected 1 to 240"),
-        (["--width", "4"], 2, "--width: expected 8 to 8192 pixels, got 4"),
-        (["--scale", "-1"], 2, "--scale: expected a number above 0"),
-        (["--out", "{room}/rollout.json"], 2, "rollout.json exists; name another file"),
-        (["--out", "{room}/rollout.json/path.json"], 2, "--out: expected a place to write"),
+        (["--fps", "0"], 2, "--fps: expected a whole number from 1 to 240"),
+        (["--width", "4"], 2, "--width: expected a whole number from 8 to 8,192, got 4"),
+        (["--scale", "-1"], 2, "--scale: expected a number from 1e-06"),
+        (["--out", "{room}/rollout.json"], 2, "rollout.json: exists already"),
+        (["--out", "{room}/rollout.json/path.json"], 2, "path.json: cannot write there"),
     ],
 )
 def test_impossible_options_end_in_one_line(tmp_path, capsys, options, code, text):

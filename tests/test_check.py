@@ -5,18 +5,18 @@ import numpy as np
 import open3d
 import pytest
 from check_rollout import SPIN, write_walk
+from pose_faults import FAULTS, Fault, write_faulty
 from rrd import entities, verify
+from scipy.spatial.transform import Rotation
 
 from avp_habitat import command
 from avp_habitat.errors import UsageError
-from avp_habitat.poses import camera_to_world, y_up_to_z_up
+from avp_habitat.poses import y_up_to_z_up
 from avp_habitat.rollout.format import read_rollout
 from avp_habitat.rollout.images import read_depth
 from avp_habitat.scenes.loader import load_scene
 from avp_nerfstudio.check.__main__ import main
-from avp_nerfstudio.check.cloud import rotation_matrix, rotation_vector
 from avp_nerfstudio.check.depth_maps import load_depth_maps
-from avp_nerfstudio.check.faults import FAULTS, Fault, write_faulty
 from avp_nerfstudio.check.geometry import check_geometry
 from avp_nerfstudio.check.outputs import choose_folder
 from avp_nerfstudio.check.shape import check_format
@@ -112,7 +112,7 @@ def right_poses(right):
 def test_rolled_cameras_are_counted(correct, tmp_path):
     def roll(right, _):
         frames = right.frames.copy()
-        frames[4, :3, :3] = frames[4, :3, :3] @ rotation_matrix(np.array([0.0, 0.0, 0.1]))
+        frames[4, :3, :3] = frames[4, :3, :3] @ Rotation.from_rotvec([0.0, 0.0, 0.1]).as_matrix()
         return type(right)(frames, right.heldout, right.intrinsics)
 
     verdict = format_of(write_faulty(correct, tmp_path / "faulty", Fault("roll", roll, "")))
@@ -177,15 +177,6 @@ def test_a_single_frame_passes_and_says_that_nothing_was_compared(tmp_path):
     geometry = check_geometry(read_rollout(write_walk(tmp_path / "one", SPIN[:1], heldout=0)))
     assert geometry.verdicts[0].passed
     assert "nothing is seen in two pictures" in geometry.verdicts[0].text
-
-
-@pytest.mark.parametrize("vector", [(0.0, 0.0, 0.0), (0.1, -0.2, 0.3), (0.0, 2.5, 0.0)])
-def test_rotation_vectors_and_matrices_belong_together(vector):
-    rotation = rotation_matrix(np.array(vector))
-    np.testing.assert_allclose(rotation_vector(rotation), vector, atol=1e-12)
-    yaw = camera_to_world(np.zeros((1, 3)), yaw=np.array([vector[1]]), pitch=np.zeros(1))[0, :3, :3]
-    if vector[0] == 0:
-        np.testing.assert_allclose(rotation, yaw, atol=1e-12)
 
 
 def test_the_command_writes_report_picture_cloud_and_recording(correct, tmp_path, capsys):

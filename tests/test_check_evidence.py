@@ -9,10 +9,9 @@ from wall_walk import TURNING, WALKING, write_wall
 
 from avp_habitat.poses import camera_to_world
 from avp_habitat.rollout.format import read_rollout
-from avp_nerfstudio.check.__main__ import Request, check
-from avp_nerfstudio.check.pictures.causes import best_focal_factor
+from avp_nerfstudio.check.__main__ import Check, check
+from avp_nerfstudio.check.pictures.causes import best_focal_factor, gain_limit
 from avp_nerfstudio.check.pictures.evidence import check_pictures, judge
-from avp_nerfstudio.check.pictures.frames import gain_limit
 from avp_nerfstudio.check.pictures.matching import match_pictures
 from avp_nerfstudio.check.pictures.rays import Stacked, estimate_relative_poses
 
@@ -43,7 +42,7 @@ def test_correct_poses_before_a_wall_that_repeats_itself_pass(tmp_path, poses, t
 
 
 def test_all_checks_of_such_a_rollout_pass(wall, tmp_path):
-    verdicts = check(Request(wall.folder, tmp_path / "out"))
+    verdicts, _ = check(Check(wall.folder, out=tmp_path / "out"))
     assert [verdict.name for verdict in verdicts if not verdict.passed] == []
     assert verdicts[-1].figures["rotation_median_deg"] > 0.5
 
@@ -91,7 +90,7 @@ def test_exchanged_picture_files_are_named_by_the_whole_check(tmp_path):
     first.rename(aside)
     second.rename(first)
     aside.rename(second)
-    verdicts = {verdict.name: verdict for verdict in check(Request(folder, tmp_path / "out"))}
+    verdicts = {verdict.name: verdict for verdict in check(Check(folder, out=tmp_path / "out"))[0]}
     assert all(verdicts[name].passed for name in ("format", "depth agreement", "ICP correction"))
     assert not verdicts["reprojection"].passed
     causes = {verdict.cause for verdict in verdicts.values() if not verdict.passed}

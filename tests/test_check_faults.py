@@ -3,9 +3,9 @@ import re
 import numpy as np
 import pytest
 from check_rollout import write_walk
+from pose_faults import FAULTS, MORE_FAULTS, Fault, write_faulty
 
 from avp_habitat.rollout.format import read_rollout
-from avp_nerfstudio.check.faults import FAULTS, MORE_FAULTS, Fault, write_faulty
 from avp_nerfstudio.check.geometry import check_geometry
 from avp_nerfstudio.check.shape import check_format
 

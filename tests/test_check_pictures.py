@@ -70,7 +70,7 @@ POSES = walk_poses()
 FAULTS = {
     "flip": (habitat_to_opencv(POSES), CAMERA, "y and z flipped"),
     "transposed": (transposed(POSES), CAMERA, "rotations look transposed"),
-    "inverse": (np.linalg.inv(POSES), CAMERA, "world-to-camera written as camera-to-world"),
+    "inverse": (np.linalg.inv(POSES), CAMERA, "look like world_to_camera: expected"),
     "long focal length": (POSES, replace(CAMERA, fx=164.8, fy=164.8), r"focal length looks [23]\.\d % too long"),
     "short focal length": (POSES, replace(CAMERA, fx=155.2, fy=155.2), r"focal length looks [23]\.\d % too short"),
     "sides swapped": (POSES, replace(CAMERA, cx=CAMERA.cy, cy=CAMERA.cx), "width and height look swapped"),
@@ -78,9 +78,9 @@ FAULTS = {
     "two exchanged": (exchanged(POSES, 4, 9), CAMERA, "frames 4 and 9 look exchanged"),
     "neighbours exchanged": (exchanged(POSES, 9, 10), CAMERA, "frames 9 and 10 look exchanged"),
     "5 cm": (moved(POSES, 6, [0.03, 0, 0.04]), CAMERA, r"pose of frame 6 looks [45]\.\d cm and 0\.\d degrees off"),
-    "shift": (np.concatenate([POSES[1:], POSES[-1:]]), CAMERA, "one frame ahead of their pictures"),
-    "shift back": (np.concatenate([POSES[:1], POSES[:-1]]), CAMERA, "one frame behind their pictures"),
-    "pitch": (pitch_in_degrees(POSES), CAMERA, "pitch looks like degrees written as radians"),
+    "shift": (np.concatenate([POSES[1:], POSES[-1:]]), CAMERA, "each frame has the pose of the next one"),
+    "shift back": (np.concatenate([POSES[:1], POSES[:-1]]), CAMERA, "each frame has the pose of the previous one"),
+    "pitch": (pitch_in_degrees(POSES), CAMERA, "pitch in degrees was taken for radians"),
 }
 
 
@@ -95,7 +95,7 @@ def test_a_fault_is_seen_and_named(matches, fault):
 def test_a_fault_of_all_poses_fails_both_verdicts_with_its_cause(matches):
     verdicts = judge(matches, np.linalg.inv(POSES), CAMERA)
     assert [verdict.passed for verdict in verdicts] == [False, False]
-    assert all("world-to-camera" in str(verdict.cause) for verdict in verdicts)
+    assert all("world_to_camera" in str(verdict.cause) for verdict in verdicts)
 
 
 def test_a_fault_of_one_frame_fails_and_names_it(matches):

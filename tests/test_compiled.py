@@ -12,7 +12,7 @@ import pytest
 from no_rights import without_root_rights
 
 ROOT = Path(__file__).resolve().parent.parent
-KERNEL = "import json; from avp_habitat.task.observations import draw; "
+KERNEL = "import json; from avp_habitat.task.floor_map import draw; "
 RUN = "print(json.dumps(draw.stats.cache_path))"
 
 

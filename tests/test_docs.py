@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 from math import cos, sin
 from pathlib import Path
 
+import docs_modules
 import pytest
 import yaml
 
@@ -19,8 +20,6 @@ from avp_habitat.task.settings import ACTION_NAMES
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
-sys.path.insert(0, str(ROOT / "scripts"))
-import docs_modules  # noqa: E402
 
 
 def pages_of(nav):

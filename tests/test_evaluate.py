@@ -19,6 +19,7 @@ from tracking import mlflow_home
 
 from avp_habitat import command
 from avp_habitat.errors import PolicyError
+from avp_habitat.metrics import mean_and_half_width
 from avp_habitat.policies.registry import make_policy, steps_of
 from avp_habitat.rollout.drawing import draw_trajectory
 from avp_habitat.rollout.images import read_rgb
@@ -26,7 +27,7 @@ from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.rewards import RewardConstants
 from avp_habitat.task.settings import TaskSettings
 from avp_sb3.evaluate import main
-from avp_sb3.evaluation.policy import PolicyResult, evaluate_policy, held_curve, mean_and_half_width
+from avp_sb3.evaluation.policy import PolicyResult, evaluate_policy, held_curve
 from avp_sb3.evaluation.report import ReportError, read_report, summary, table, write_report
 
 SETTINGS = TaskSettings(budget=6, width=16, height=12)
@@ -124,7 +125,7 @@ def test_a_model_gets_the_observation_it_was_trained_on_and_exact_rays(model):
 
 def result(policy="mine", episodes=3, **changes):
     rng = np.random.default_rng(len(policy))
-    figures = {name: rng.random(episodes) for name in ("coverage", "views", "ei")}
+    figures = {name: rng.random(episodes) for name in ("coverage", "views", "ei", "sofas seen")}
     return PolicyResult(policy, np.arange(5, 5 + episodes), rng.random((episodes, 4)), figures, **changes)
 
 
@@ -164,6 +165,7 @@ def test_the_table_shows_means_with_their_intervals_in_percent():
     coverage = next(row for row in rows if row[0] == "coverage [%]")
     assert coverage[1] == f"{mean:.1f} ± {half:.1f}"
     assert re.fullmatch(r"\d+\.\d", coverage[2])
+    assert "sofas seen" in {row[0] for row in rows}, "a figure that the suite does not list"
     assert rows[-1] == ["episodes", "3", "1"]
     assert rows[-2][:2] == [
         "CpV [%/view]",
@@ -175,7 +177,8 @@ def test_the_table_shows_means_with_their_intervals_in_percent():
 def test_the_command_compares_writes_and_logs(tmp_path, monkeypatch, capsys, model):
     mlflow_home(tmp_path, monkeypatch)
     words = ["--policy", "heuristic", "--policy", model, "--policy", "heuristic", "--episodes", "2", "--out", "report"]
-    assert evaluate(*words) == 0
+    monkeypatch.setattr("sys.argv", ["evaluate.py", *WORDS, *words])
+    assert command.run(main) == 0
     printed = capsys.readouterr().out
     report = json.loads((tmp_path / "report" / "evaluation.json").read_text())
     assert report["command"].startswith("python -m avp_sb3.evaluate --scene builtin:0")
@@ -257,8 +260,8 @@ def test_a_store_that_does_not_answer_leaves_the_report(tmp_path, monkeypatch, c
         (["--policy", "random", "--policy", "gone.zip"], 2, r"gone\.zip: no such model file"),
         (["--policy", "random", "--observation", "maps"], 2, "unknown observation 'maps': .*did you mean 'map'"),
         (["--policy", "random", "--reward", "propose"], 2, "unknown reward 'propose'"),
-        (["--policy", "random", "--episodes", "0"], 2, "--episodes: expected at least 1, got 0"),
-        (["--policy", "random", "--seed", "-1"], 2, "--seed: expected a whole number from 0, got -1"),
+        (["--policy", "random", "--episodes", "0"], 2, "--episodes: expected a whole number from 1 to 1e.06, got 0"),
+        (["--policy", "random", "--seed", "-1"], 2, "--seed: expected a whole number from 0 to .*, got -1"),
         (["--policy", "random", "--out", "."], 2, "--out .: exists already"),
         (["--policy", "random", "--out", "/proc/no/r"], 1, "--out /proc/no/r: cannot write there: /proc"),
         (["--policy", "random", "--out", "/dev/null/r"], 1, "--out /dev/null/r: cannot write there: /dev/null"),

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from small_rollout import write_small_rollout
 
-from avp_experiment.top_down import floor_map, floor_of
-from avp_habitat.errors import RolloutError
+from avp_experiment.cells import floor_map
+from avp_experiment.results import floor_of
 from avp_habitat.rollout import images
 
 
@@ -38,9 +38,3 @@ def add_yaw(path):
 
 def test_a_rollout_without_a_floor_has_no_map(tmp_path):
     assert floor_map(write_small_rollout(tmp_path / "r")) is None
-
-
-def test_a_table_of_steps_without_angles_is_named(tmp_path):
-    folder = with_floor(tmp_path / "r", np.ones((2, 2), dtype=np.uint16))
-    with pytest.raises(RolloutError, match=r"steps\.csv: expected x_m, z_m and yaw_rad"):
-        floor_map(folder)

@@ -8,18 +8,17 @@ import pytest
 
 from avp_experiment import compare
 from avp_experiment.cells import COLLECT, RECONSTRUCT, TRAIN, plan
-from avp_experiment.configuration import DEFAULT, METHODS, Configuration, Scene, chosen_methods, keep
-from avp_experiment.look import look_of
-from avp_experiment.presets import PRESETS
-from avp_experiment.store import Store
+from avp_experiment.configuration import DEFAULT, PRESETS, Configuration, Scene, chosen_methods, known_methods
+from avp_experiment.folder import Folder, open_folder
+from avp_experiment.plots import style_of
 from avp_habitat import command
 
 SCENES = (Scene("a.glb", "a.glb", "11", "train"), Scene("dir/b.glb", "b.glb", "22", "unseen"))
 
 
 def configuration(methods=("heuristic", "coverage", "proposed_rooms"), seeds=2, **changes):
-    preset = replace(PRESETS["cpu"], **{"starts": 2, "prefixes": (20, 40), "rooms": 3} | changes)
-    return Configuration("cpu", preset, seeds, SCENES, chosen_methods(methods))
+    preset = replace(PRESETS["cpu"], **{"seeds": seeds, "starts": 2, "prefixes": (20, 40), "rooms": 3} | changes)
+    return Configuration("cpu", preset, SCENES, chosen_methods(methods))
 
 
 def option(cell, name):
@@ -55,17 +54,47 @@ def test_all_methods_start_at_the_same_places_and_no_place_comes_twice(tmp_path)
 
 
 def test_the_users_number_of_starts_replaces_the_presets():
-    options = compare.read_options(["--preset", "smoke", "--starts", "4", "--unseen", "none"])
-    assert options.configuration.preset == replace(PRESETS["smoke"], starts=4)
+    found = compare.Compare(preset="smoke", starts="4", unseen="none").configuration()
+    assert found.preset == replace(PRESETS["smoke"], starts=4)
+
+
+def test_what_others_bring_is_a_method_and_a_figure_by_its_place(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "brought.py").write_text(
+        "from avp_habitat import Figure, metric, reward\n"
+        "class Still:\n"
+        "    def __init__(self, env, seed=None): ...\n"
+        "    def predict(self, observation, state=None, episode_start=None, deterministic=False): ...\n"
+        "@reward(needs_surface=True)\n"
+        "def thrifty(facts, constants): ...\n"
+        "@metric(Figure('turned', 'turned'))\n"
+        "def turned(trajectory): ...\n"
+    )
+    words = {"methods": "brought:thrifty_rooms,brought:Still,random", "metrics": "brought:turned", "unseen": "none"}
+    found = compare.Compare(preset="smoke", **words).configuration()
+    cells = plan(found, tmp_path, tracking="avp")
+    training, *rollouts = [cell for cell in cells if cell.kind != RECONSTRUCT]
+    assert training.name == "brought.thrifty_rooms-0"
+    assert [option(training, name) for name in ("--reward", "--observation", "--scene")] == [
+        "brought:thrifty",
+        "surface_map",
+        "builtin:100",
+    ]
+    assert [option(cell, "--policy") for cell in rollouts] == [
+        "random",
+        str(training.output(tmp_path)),
+        "brought:Still",
+    ]
+    assert {option(cell, "--metrics") for cell in rollouts} == {"brought:turned"}
 
 
 def test_more_starts_leave_what_is_there(tmp_path):
     few, more = (plan(configuration(starts=starts), tmp_path, tracking="avp") for starts in (1, 3))
     words = {cell.key: cell.words for cell in more}
     assert all(words[cell.key] == cell.words for cell in few)
-    keep(configuration(starts=1), tmp_path)
-    keep(configuration(starts=3), tmp_path)
-    keep(configuration(starts=2), tmp_path)
+    open_folder(configuration(starts=1), tmp_path)
+    open_folder(configuration(starts=3), tmp_path)
+    open_folder(configuration(starts=2), tmp_path)
 
 
 def test_a_policy_is_trained_in_the_scenes_of_training_or_in_rooms_and_never_in_unseen_ones(tmp_path):
@@ -92,50 +121,50 @@ def test_only_whole_rollouts_of_the_first_seed_and_start_keep_pictures(tmp_path)
 
 
 def test_what_a_finished_training_left_is_not_begun_again_and_an_interrupted_one_goes_on(tmp_path):
-    store = Store(tmp_path)
+    folder = Folder(tmp_path)
     training = plan(configuration(), tmp_path, tracking="avp")[0]
-    assert store.prepare(training) == training.words
+    assert folder.prepare(training) == training.words
     training.output(tmp_path).write_bytes(b"a model")
-    assert store.prepare(training)[-2:] == ("--resume", str(training.output(tmp_path)))
-    store.fail(training, "of its model")
-    assert store.prepare(training) == training.words
+    assert folder.prepare(training)[-2:] == ("--resume", str(training.output(tmp_path)))
+    folder.fail(training, "of its model")
+    assert folder.prepare(training) == training.words
     assert not training.output(tmp_path).exists()
-    store.finish(training, {"seconds": 1.0})
-    assert store.is_done(training)
+    folder.finish(training, {"seconds": 1.0})
+    assert folder.is_done(training)
 
 
 def test_what_an_interrupted_rollout_left_is_cleared(tmp_path):
-    store = Store(tmp_path)
+    folder = Folder(tmp_path)
     rollout = next(cell for cell in plan(configuration(), tmp_path, tracking="avp") if cell.kind == COLLECT)
     rollout.output(tmp_path).mkdir(parents=True)
-    assert store.prepare(rollout) == rollout.words
+    assert folder.prepare(rollout) == rollout.words
     assert not rollout.output(tmp_path).exists()
 
 
 def test_first_frames_that_are_all_of_a_short_rollout_are_not_reconstructed_twice(tmp_path):
-    store = Store(tmp_path)
+    folder = Folder(tmp_path)
     cells = plan(configuration(), tmp_path, tracking="avp")
     prefixes = [cell for cell in cells if cell.frames is not None][:2]
     assert {cell.frames for cell in prefixes} == {20, 40}
-    store.prepare(prefixes[0].needs)
-    store.finish(prefixes[0].needs, {"facts": {"metrics": {"views": 30.0}}})
-    assert {cell.frames: store.is_done(cell) for cell in prefixes} == {20: False, 40: True}
+    folder.prepare(prefixes[0].needs)
+    folder.finish(prefixes[0].needs, {"facts": {"metrics": {"views": 30.0}}})
+    assert {cell.frames: folder.is_done(cell) for cell in prefixes} == {20: False, 40: True}
 
 
 def test_a_folder_keeps_one_configuration_and_takes_more_methods(tmp_path):
-    keep(configuration(), tmp_path / "e")
-    keep(configuration(("greedy", "surface")), tmp_path / "e")
+    open_folder(configuration(), tmp_path / "e")
+    open_folder(configuration(("greedy", "surface")), tmp_path / "e")
     with pytest.raises(Exception, match=r"another configuration: seeds 2 there, 5 asked for"):
-        keep(configuration(seeds=5), tmp_path / "e")
+        open_folder(configuration(seeds=5), tmp_path / "e")
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path):
     (tmp_path / "thesis.txt").write_text("three years of work")
     with pytest.raises(Exception, match=r"is no experiment's folder"):
-        keep(configuration(), tmp_path)
+        open_folder(configuration(), tmp_path)
     (tmp_path / "experiment.json").write_text("{")
     with pytest.raises(Exception, match=r"experiment\.json: expected an experiment's configuration"):
-        keep(configuration(), tmp_path)
+        open_folder(configuration(), tmp_path)
 
 
 def refused(capsys, *words):
@@ -149,7 +178,11 @@ def refused(capsys, *words):
 @pytest.mark.parametrize(
     ("words", "code", "text"),
     [
-        (("--preset", "cpuu"), 2, "unknown preset 'cpuu': expected one of cpu, gpu, paper, smoke; did you mean 'cpu'?"),
+        (
+            ("--preset", "cpuu"),
+            2,
+            "unknown preset 'cpuu': expected one of cpu, demo, gpu, paper, smoke; did you mean",
+        ),
         (("--methods", "heuristic,propposed"), 2, "did you mean 'proposed'?"),
         (("--methods", ","), 2, "methods: expected at least one"),
         (("--seeds", "0"), 2, "seeds: expected a whole number from 1, or auto, got '0'"),
@@ -188,19 +221,23 @@ def test_a_disk_that_is_too_small_is_refused_with_the_estimate(tmp_path, monkeyp
 
 
 def test_a_second_program_in_the_same_folder_is_refused(tmp_path):
-    with Store(tmp_path).alone(), pytest.raises(Exception, match="another program is working"), Store(tmp_path).alone():
+    with (
+        Folder(tmp_path).alone(),
+        pytest.raises(Exception, match="another program is working"),
+        Folder(tmp_path).alone(),
+    ):
         pass
-    with Store(tmp_path).alone():
+    with Folder(tmp_path).alone():
         pass
 
 
 def test_the_configuration_that_is_kept_is_readable(tmp_path):
-    keep(configuration(), tmp_path / "e")
+    open_folder(configuration(), tmp_path / "e")
     found = json.loads((tmp_path / "e" / "experiment.json").read_text())
     assert found["seeds"] == 2
     assert [scene["role"] for scene in found["scenes"]] == ["train", "unseen"]
 
 
-def test_every_method_has_a_look_of_its_own():
-    looks = [look_of(method) for method in METHODS]
-    assert len(set(looks)) == len(looks)
+def test_every_method_has_a_style_of_its_own():
+    styles = [style_of(method) for method in known_methods()]
+    assert len(set(styles)) == len(styles)

@@ -10,7 +10,7 @@ from pathlib import Path
 import experiment_walks
 import pytest
 
-from avp_experiment.store import DONE, Store
+from avp_experiment.folder import DONE, Folder
 from avp_habitat.rollout.format import read_rollout
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -58,7 +58,7 @@ def test_killed_half_way_it_goes_on_with_what_is_missing_and_repeats_nothing(tmp
     assert {path: path.read_bytes() for path in before} == before
     for cell in experiment_walks.rollouts(tmp_path):
         assert len(read_rollout(cell.output(tmp_path)).frames) == 3
-        record = Store(tmp_path).record(cell)
+        record = Folder(tmp_path).record(cell)
         assert len(record["facts"]["coverage_curve"]) == 3
         assert record["facts"]["visibility_curve"][-1] == pytest.approx(
             record["facts"]["metrics"]["visibility"], abs=1e-6
@@ -70,7 +70,7 @@ def test_no_cell_outlives_the_experiment(tmp_path, number):
     program = tmp_path / "waits.py"
     program.write_text(f"import pathlib, time\ndef main(argv):\n    pathlib.Path({str(tmp_path)!r}, 'begun').touch()\n"
                        "    time.sleep(600)\n")  # fmt: skip
-    experiment = start(tmp_path, program)
+    experiment = start(tmp_path, program.stem)
     wait_for((tmp_path / "begun").exists)
     assert len(processes_of(experiment.pid)) > 1
     os.kill(experiment.pid, number)
@@ -94,22 +94,22 @@ def test_a_cell_that_fails_is_told_with_its_reason_and_the_others_are_done(tmp_p
     lost = replace(other, words=tuple(word.replace("builtin:0", "gone.glb") for word in other.words))
     after = replace(other, name="after", needs=lost)
     runner = experiment_walks.run(tmp_path, [lost, after, whole], jobs=2)
-    store = Store(tmp_path)
+    folder = Folder(tmp_path)
     assert set(runner.failed) == {lost.key, after.key}
     assert "gone.glb" in runner.failed[lost.key]
     assert runner.failed[lost.key].startswith("exit code 1: ")
     assert runner.failed[after.key] == f"needs {lost.key}, which failed"
-    assert "gone.glb" in store.failure(lost)
-    assert store.is_done(whole)
+    assert "gone.glb" in folder.failure(lost)
+    assert folder.is_done(whole)
     # Tried again, and better, it is not called failed any more.
     assert experiment_walks.run(tmp_path, [other, whole]).failed == {}
-    assert store.is_done(other)
-    assert store.failure(other) is None
+    assert folder.is_done(other)
+    assert folder.failure(other) is None
 
 
-def test_a_command_that_dies_is_told_by_its_signal(tmp_path):
+def test_a_command_that_dies_is_told_by_its_signal(tmp_path, monkeypatch):
     cell = experiment_walks.rollouts(tmp_path)[0]
-    program = tmp_path / "dies.py"
-    program.write_text("import os, signal\ndef main(argv):\n    os.kill(os.getpid(), signal.SIGSEGV)\n")
-    runner = experiment_walks.run(tmp_path, [replace(cell, words=("python", str(program)))])
+    (tmp_path / "dies.py").write_text("import os, signal\ndef main(argv):\n    os.kill(os.getpid(), signal.SIGSEGV)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    runner = experiment_walks.run(tmp_path, [replace(cell, words=("python", "-m", "dies"))])
     assert runner.failed[cell.key].startswith("killed by signal 11")

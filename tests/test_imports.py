@@ -18,12 +18,11 @@ MAY_IMPORT = {
 LIGHT = (
     "errors",
     "metrics",
+    "plugins",
     "poses",
     "ranges",
     "rollout.format",
-    "rollout.png",
-    "sight.coverage",
-    "sight.visibility",
+    "rollout.images",
     "task.rewards",
     "task.trajectory",
 )

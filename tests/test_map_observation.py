@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from corridor import Corridor
 
-from avp_habitat.task.observations import CELL_M, CHANNELS, SIDE, MapObserver
+from avp_habitat.task.floor_map import CELL_M, CHANNELS, SIDE, MapObserver
 from avp_habitat.task.rewards import RewardConstants
 from avp_habitat.task.settings import TaskSettings
 from avp_habitat.task.task import ViewpointTask

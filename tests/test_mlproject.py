@@ -1,34 +1,27 @@
 import importlib
 import re
-import runpy
 import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_type_hints
 
 import mlflow.projects
 import pytest
 import yaml
+
+from avp_habitat import command
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = yaml.safe_load((ROOT / "MLproject").read_text(encoding="utf-8"))
 POINTS = PROJECT["entry_points"]
 
 
-def words_of(name):
-    """The command line of an entry point with its defaults, as MLflow puts it together."""
+def commands_of(name):
+    """The command lines of an entry point with its defaults, as MLflow puts them together: the last one is the work."""
     point = POINTS[name]
     defaults = {key: value["default"] for key, value in point.get("parameters", {}).items()}
-    return shlex.split(point["command"].format(**defaults))
-
-
-def options_of(words):
-    """What the command's own parser makes of a command line."""
-    assert words[:2] == ["python", "-m"]
-    name, *rest = words[3:] if words[2] == "avp_experiment.part" else words[2:]
-    if name.endswith(".py"):
-        return runpy.run_path(str(ROOT / name))["_parser"]().parse_args(rest)
-    return importlib.import_module(name)._parser().parse_args(rest)
+    return [shlex.split(line) for line in point["command"].format(**defaults).split(" && ")]
 
 
 def test_the_project_has_the_entry_points_that_its_page_shows():
@@ -42,9 +35,11 @@ def test_it_uses_the_environment_that_is_there():
 
 @pytest.mark.parametrize("name", POINTS)
 def test_each_entry_point_is_a_command_that_takes_its_parameters(name):
-    options = vars(options_of(words_of(name)))
-    for parameter in POINTS[name]["parameters"]:
-        assert parameter in options or parameter in {"reconstruction"}, parameter
+    assert set(re.findall(r"{(\w+)}", POINTS[name]["command"])) == set(POINTS[name]["parameters"])
+    python, flag, module, *words = commands_of(name)[-1]
+    assert (python, flag) == ("python", "-m")
+    options = next(iter(get_type_hints(importlib.import_module(module).main).values()))
+    assert isinstance(command.parse(options, words), options)
 
 
 @pytest.mark.parametrize("name", POINTS)
@@ -69,20 +64,8 @@ def test_a_user_mistake_ends_mlflow_run_with_the_commands_one_line(tmp_path, mon
 @pytest.mark.parametrize("name", POINTS)
 def test_a_python_without_the_packages_is_told_in_one_line(name):
     # -S leaves site-packages out, as the `python` of a path without the environment does.
-    words = [sys.executable, "-S", *words_of(name)[1:]]
+    words = [sys.executable, "-S", *commands_of(name)[0][1:]]
     answer = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
     assert answer.returncode == 1
     assert answer.stderr.strip().endswith("first: source .venv/bin/activate")
     assert len(answer.stderr.strip().splitlines()) == 1
-
-
-@pytest.mark.parametrize("name", [name for name in POINTS if name != "compare"])
-def test_a_part_takes_its_words_and_answers_as_it_does_alone(name):
-    target = words_of(name)[3]
-    lines = (["-m", "avp_experiment.part", target], [target] if target.endswith(".py") else ["-m", target])
-    through, alone = (
-        subprocess.run([sys.executable, *line, "--no-such"], cwd=ROOT, capture_output=True, text=True) for line in lines
-    )
-    assert through.returncode == alone.returncode == 2
-    assert through.stderr == alone.stderr
-    assert "error: " in alone.stderr

@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from avp_habitat.errors import SceneError
-from avp_habitat.navigation.area import NavigableArea, build_area
+from avp_habitat.navigation.area import NavigableArea
+from avp_habitat.navigation.build import build_area
 from avp_habitat.navigation.parts import _border_distance
 from avp_habitat.navigation.settings import NavigationSettings
 from avp_habitat.scenes.mesh import TexturedMesh

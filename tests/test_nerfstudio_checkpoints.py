@@ -1,18 +1,25 @@
-import collections
+import json
 import os
 import pickle
+import re
+import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from nerfstudio_room import write_room
 
 pytest.importorskip("nerfstudio")
 
 from nerfstudio.utils.eval_utils import eval_load_checkpoint
 
-from avp_habitat.errors import AVPError
-from avp_nerfstudio.method.checkpoints import UnsafeCheckpointError, allow_checkpoints
+from avp_habitat import command
+from avp_nerfstudio.log import main as log
+from avp_nerfstudio.method.checkpoints import allow_checkpoints, loading_fault
+
+BEFORE = Path(__file__).parent / "data/before/nerfstudio"
 
 
 class RunsCode:
@@ -61,46 +68,37 @@ def test_importing_the_plugin_is_what_allows_checkpoints(tmp_path):
     assert torch.load(checkpoint(tmp_path / "a.ckpt"))["step"] == 3
 
 
-def nerfstudio_loads(folder):
-    """What every `ns-` command but ns-train loads its checkpoint with."""
-    return eval_load_checkpoint(SimpleNamespace(load_dir=folder, load_step=3), SimpleNamespace(load_pipeline=print))
-
-
-@pytest.mark.parametrize(
-    ("payload", "name"),
-    [
-        (RunsCode, "(posix|os).mkdir"),
-        (lambda target: collections.UserDict(target=str(target)), "collections.UserDict"),
-        (lambda target: np.zeros(2), "numpy._core.multiarray._reconstruct"),
-    ],
-    ids=["a call", "a class", "an array"],
-)
-def test_nerfstudio_refuses_every_other_type_by_name_in_one_line(tmp_path, payload, name):
-    target = tmp_path / "made-by-a-checkpoint"
-    path = checkpoint(tmp_path / "step-000000003.ckpt", payload=payload(target))
-    with pytest.raises(UnsafeCheckpointError, match=f"found {name}, which could run code") as error:
-        nerfstudio_loads(tmp_path)
-    assert isinstance(error.value, AVPError)
-    assert str(error.value.code).startswith(f"error: {path}: expected the tensors and numbers")
-    assert "\n" not in str(error.value.code)
+def test_nerfstudio_loads_its_own_checkpoints_and_nothing_else(tmp_path):
+    """By what every `ns-` command but ns-train loads its checkpoint with."""
+    path, target = tmp_path / "step-000000003.ckpt", tmp_path / "made-by-a-checkpoint"
+    where = SimpleNamespace(load_dir=tmp_path, load_step=3), SimpleNamespace(load_pipeline=print)
+    checkpoint(path)
+    assert eval_load_checkpoint(*where) == (path, 3)
+    checkpoint(path, payload=RunsCode(target))
+    with pytest.raises(pickle.UnpicklingError) as error:
+        eval_load_checkpoint(*where)
     assert not target.exists()
+    text = loading_fault(path, error.value)
+    assert re.match(f"{path}: expected the tensors and numbers .*found (posix|os).mkdir, which could run code", text)
+    assert "\n" not in text
 
 
-def test_nerfstudio_loads_its_own_checkpoints(tmp_path, capsys):
-    path = checkpoint(tmp_path / "step-000000003.ckpt")
-    assert nerfstudio_loads(tmp_path) == (path, 3)
+@pytest.mark.filterwarnings("ignore")  # of nerfstudio's own command
+def test_a_training_of_before_the_modules_moved_opens(tmp_path, monkeypatch):
+    """Made at 78b2946 from the same room: its config.yml names avp_nerfstudio.trainer and the like."""
+    write_room(tmp_path / "room", frames=4)
+    folder = tmp_path / "outputs/e/avp-nerfacto/t"
+    (folder / "nerfstudio_models").mkdir(parents=True)
+    shutil.copy(BEFORE / "config.yml", folder)
+    shutil.copy(BEFORE / "step-000000011.ckpt", folder / "nerfstudio_models")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    from nerfstudio.scripts.eval import ComputePSNR
 
-
-def test_other_errors_of_nerfstudio_stay_what_they_are(tmp_path):
-    path = checkpoint(tmp_path / "step-000000003.ckpt")
-    path.write_bytes(path.read_bytes()[:-80])
-    with pytest.raises(RuntimeError, match="PytorchStreamReader"):
-        nerfstudio_loads(tmp_path)
-
-
-def test_other_programs_get_torchs_own_refusal_and_their_own_way(tmp_path):
-    path = checkpoint(tmp_path / "a.ckpt", payload=collections.UserDict(a=1))
-    with pytest.raises(pickle.UnpicklingError, match="Weights only load failed") as error:
-        torch.load(path)
-    assert not isinstance(error.value, SystemExit)
-    assert torch.load(path, weights_only=False)["payload"] == {"a": 1}
+    ComputePSNR(load_config=folder / "config.yml", output_path=tmp_path / "scores.json").main()
+    theirs = json.loads((tmp_path / "scores.json").read_text())["results"]
+    # What ns-eval gave at 78b2946.
+    assert theirs["psnr"] == pytest.approx(16.1335, abs=1e-3)
+    assert command.run(log, [str(folder), "--mlflow", "off", "--output", str(tmp_path / "held")]) == 0
+    table = json.loads((tmp_path / "held/heldout.json").read_text())
+    assert table["mean"]["psnr"] == pytest.approx(16.1335, abs=1e-3)

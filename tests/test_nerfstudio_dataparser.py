@@ -20,10 +20,10 @@ pytest.importorskip("nerfstudio")
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.datasets.depth_dataset import DepthDataset
 
-from avp_nerfstudio.data import verification
-from avp_nerfstudio.data.dataparser import AVPDataParserConfig, UnusableRolloutError
-from avp_nerfstudio.data.frames import spread_order
-from avp_nerfstudio.data.seen_points import MOST_VIEWS
+from avp_nerfstudio.data import frames
+from avp_nerfstudio.data.dataparser import AVPDataParserConfig
+from avp_nerfstudio.data.frames import MOST_VIEWS, spread_order
+from avp_nerfstudio.data.refusals import UnusableRolloutError
 
 Z_UP = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0]])
 
@@ -160,9 +160,7 @@ def test_merged_rollouts_train_with_all_frames_and_evaluate_on_the_first_ones_he
 
 def test_rollouts_of_different_scenes_are_not_merged(pair, tmp_path):
     other = write_known_room(tmp_path / "other", scene="b" * 64, frames=1)
-    text = (
-        r"other: captured in the scene 'room b' \(sha256 bbb.*one in 'room a' \(sha256 aaa.*only rollouts of one scene"
-    )
+    text = r"other: captured in a scene of sha256 bbb.*one in a scene of sha256 aaa.*only rollouts of one scene"
     with pytest.raises(RolloutError, match=text):
         parse(pair[0], also=(pair[1], other))
     edit(other, lambda meta: meta.update(scene=None))
@@ -181,17 +179,17 @@ def test_rollouts_of_one_scene_that_lie_differently_are_not_merged(pair, lies):
 
 def test_rollouts_of_different_cameras_are_not_merged(pair, tmp_path):
     wide = write_known_room(tmp_path / "wide", frames=1, width=40)
-    text = r"wide/rollout\.json: pictures of 40x24 .*one/rollout\.json has 32x24 .*--width 32 --height 24"
+    text = r"wide/rollout\.json: expected the camera of .*one/rollout\.json, .*width=32.*found .*width=40.*--width 32"
     with pytest.raises(RolloutError, match=text):
         parse(pair[0], also=(wide,))
     edit(pair[1], lambda meta: meta["camera"].update(fx=meta["camera"]["fx"] * 1.03))
-    with pytest.raises(RolloutError, match=r"focal lengths 17\.1392, .* focal lengths 16\.64,"):
+    with pytest.raises(RolloutError, match=r"fx=16\.64, .*found.* fx=17\.139"):
         parse(pair[0], also=(pair[1],))
 
 
 def test_a_rollout_named_twice_is_refused(pair, tmp_path):
     (tmp_path / "link").symlink_to(pair[0])
-    with pytest.raises(RolloutError, match=r"link: expected each rollout once, .*\(it is .*one\)"):
+    with pytest.raises(RolloutError, match=r"link: expected each rollout once"):
         parse(pair[0], also=(pair[1], tmp_path / "link"))
 
 
@@ -316,11 +314,11 @@ def test_a_damaged_picture_is_named_before_training(broken, path):
 def test_many_pictures_are_checked_only_when_asked_for(broken, monkeypatch):
     # A held-out picture, because a few of the captured ones are decoded while parsing.
     damage(broken / "heldout/images/frame_00000.png")
-    monkeypatch.setattr(verification, "AUTOMATIC_BYTES", 1000)
+    monkeypatch.setattr(frames, "AUTOMATIC_BYTES", 1000)
     parse(broken)
     with pytest.raises(RolloutError, match="expected an undamaged PNG"):
         parse(broken, verify=True)
-    monkeypatch.setattr(verification, "AUTOMATIC_BYTES", 1_000_000)
+    monkeypatch.setattr(frames, "AUTOMATIC_BYTES", 1_000_000)
     parse(broken, verify=False)
 
 
@@ -406,13 +404,13 @@ def test_a_rollout_without_frames_cannot_be_trained_on(broken):
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"scale": 0.0}, "expected --scale above 0"),
-        ({"scale": float("nan")}, "expected --scale above 0, got nan"),
-        ({"every": 0}, "--every of at least 1"),
-        ({"max_views": -1}, "--max-views of at least 0, got -1"),
-        ({"initial_points": -1}, "--initial-points of at least 0"),
-        ({"box_margin_m": -0.1}, "--box-margin-m of at least 0"),
-        ({"order": "backwards"}, "unknown --order 'backwards': expected one of steps, spread, random"),
+        ({"scale": 0.0}, "scale: expected a number from 1e-06 to .*, got 0.0"),
+        ({"scale": float("nan")}, "scale: expected .*, got nan"),
+        ({"every": 0}, "every: expected a whole number from 1"),
+        ({"max_views": -1}, "max_views: expected a whole number from 0 .*, got -1"),
+        ({"initial_points": -1}, "initial_points: expected"),
+        ({"box_margin_m": -0.1}, "box_margin_m: expected"),
+        ({"order": "backwards"}, "unknown order 'backwards': expected one of random, spread, steps"),
         ({"data": Path()}, "no rollout named; add --data"),
     ],
 )

@@ -1,6 +1,5 @@
 """How the `ns-` commands end when they cannot do what they are asked, and what they say when they can."""
 
-import json
 import re
 import shlex
 import shutil
@@ -11,11 +10,8 @@ from nerfstudio_room import write_room
 from nerfstudio_shell import Shell
 
 from avp_habitat import gpu
-from avp_habitat.errors import RolloutError
 
 pytest.importorskip("nerfstudio")
-
-from avp_nerfstudio.log import main as log
 
 SMALL = ["--pipeline.datamanager.train-num-rays-per-batch", 32, "--pipeline.model.log2-hashmap-size", 8]
 no_gpu = pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is there")
@@ -60,18 +56,20 @@ def commands(line):
 @pytest.mark.parametrize("method", ["nerfacto", "depth-nerfacto"])
 def test_a_training_for_a_gpu_that_is_not_there_names_commands_that_work_here(shell, place, tmp_path, method):
     line = last_line(train(shell, tmp_path, method, "avp-data", "--data", place / "runs/r0"))
-    assert line.startswith(f"error: {method} trains on a GPU by default, and none was found here (torch ")
+    assert line.startswith(f"error: {method} is to train on a GPU, and none was found here (torch ")
     ours, plain = commands(line)
     assert ours == ["ns-train", "avp-nerfacto", "--data", f"{place}/runs/r0"]
-    assert plain[:6] == ["ns-train", method, *gpu.WITHOUT_GPU.split()[:4]]
-    assert plain[-5:] == ["--viewer.quit-on-train-completion", "True", "avp-data", "--data", f"{place}/runs/r0"]
+    assert plain == ["ns-train", method, *gpu.WITHOUT_GPU.split(), "avp-data", "--data", f"{place}/runs/r0"]
     assert list(tmp_path.iterdir()) == []
 
 
 @no_gpu
 @pytest.mark.slow
 def test_the_command_for_this_machine_trains(shell, place, shared, tmp_path):
-    plain = commands(last_line(train(shell, tmp_path, "nerfacto", *SMALL, "avp-data", "--data", place / "runs/r0")))[1]
+    name, method, *options = commands(
+        last_line(train(shell, tmp_path, "nerfacto", "avp-data", "--data", place / "runs/r0"))
+    )[1]
+    plain = [name, method, *SMALL, "--max-num-iterations", 2, "--viewer.quit-on-train-completion", "True", *options]
     weights = {"TORCH_HOME": str(shared / "torch_home")}
     done = shell.run(*plain, cwd=tmp_path, environment=weights)
     assert done.returncode == 0, done.stderr
@@ -111,43 +109,13 @@ def assert_matches(pattern, text):
     assert re.search(pattern, text), text
 
 
-def test_scoring_from_another_folder_says_where_to_do_it(shell, place, tmp_path):
-    line = last_line(shell.run("ns-eval", "--load-config", place / CONFIG, cwd=tmp_path))
-    assert line == (
-        f"error: runs/r0: expected the rollout of {place / CONFIG}, found none: the path is relative to the folder in "
-        f"which ns-train ran, now {tmp_path}; run this command in {place}"
-    )
-    done = shell.run("ns-eval", "--load-config", place / CONFIG, "--output-path", tmp_path / "s.json", cwd=place)
-    assert done.returncode == 0
-    assert json.loads((tmp_path / "s.json").read_text())["results"]["psnr"] > 0
-
-
-@pytest.mark.parametrize(
-    "words",
-    [["ns-render", "dataset"], ["ns-export", "pointcloud", "--output-dir", "cloud"], ["ns-viewer"]],
-    ids=lambda words: words[0],
-)
-def test_every_command_that_opens_a_training_says_so(shell, place, tmp_path, words):
+@pytest.mark.parametrize("words", [["ns-eval"], ["ns-render", "dataset"]], ids=lambda words: words[0])
+def test_opening_a_training_from_another_folder_says_what_its_paths_are_relative_to(shell, place, tmp_path, words):
     line = last_line(shell.run(*words, "--load-config", place / CONFIG, cwd=tmp_path))
-    assert line.endswith(f"run this command in {place}")
-
-
-def test_moved_outputs_and_rollouts_are_told_apart(shell, place, tmp_path):
-    shutil.copytree(place / "outputs/r0/avp-nerfacto/t", tmp_path / "kept")
-    line = last_line(shell.run("ns-eval", "--load-config", "kept/config.yml", cwd=tmp_path))
-    assert line.startswith("error: runs/r0: expected the rollout of kept/config.yml, found none: the path is relative")
-    assert line.endswith("if it was moved, put it there again, or a link (ln -s WHERE_IT_LIES runs/r0)")
-    shutil.copytree(place / "runs", tmp_path / "runs")
-    line = last_line(shell.run("ns-eval", "--load-config", "kept/config.yml", cwd=tmp_path))
-    models = "outputs/r0/avp-nerfacto/t/nerfstudio_models"
-    assert line.startswith(f"error: {models}: expected the checkpoints of kept/config.yml, found none: the path is")
-    assert line.endswith(f"(ln -s WHERE_IT_LIES {models})")
-
-
-def test_pictures_of_a_training_are_made_from_its_own_folder_too(place, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(RolloutError, match=f"run this command in {place}$"):
-        log([str(place / CONFIG), "--mlflow", "off", "--output", "held"])
+    assert line == (
+        "error: runs/r0: expected a rollout folder (made by `python -m avp_habitat.collect`), found none; the path is "
+        f"relative to the folder where ns-train ran, now {tmp_path}"
+    )
 
 
 def test_a_training_shows_what_matters_and_no_known_warnings(place):

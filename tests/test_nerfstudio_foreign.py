@@ -72,7 +72,6 @@ def transforms(name="transforms.json", **content):
 
 
 SYNTHETIC = [frame(index, file_path=f"./images/{index}") for index in range(2)]
-TIMED = [{**shot, "time": 0.5} for shot in SYNTHETIC]
 SHOTS = [frame(0), frame(1)]
 FOLDERS = {
     "COLMAP in sparse/0": (lambda f: colmap(f, "sparse/0"), "a COLMAP project", "colmap .*--colmap-path sparse/0"),
@@ -82,66 +81,24 @@ FOLDERS = {
         "a COLMAP project",
         "colmap .*--colmap-path colmap/",
     ),
-    "COLMAP in text": (
-        files("sparse/0/cameras.txt", "sparse/0/images.txt"),
-        "a COLMAP project",
-        "colmap .*--colmap-path",
-    ),
-    "nerfstudio": (
-        transforms(camera_model="OPENCV", frames=SHOTS, **CAMERA),
-        "data of nerfstudio",
-        "nerfstudio-data",
-    ),
-    "nerfstudio, a camera each": (transforms(frames=[frame(0) | CAMERA]), "data of nerfstudio", "nerfstudio-data"),
-    "instant-ngp": (
-        transforms(camera_angle_x=0.9, aabb_scale=16, frames=SHOTS, **CAMERA),
-        "data of instant-ngp",
-        "instant-ngp-data",
-    ),
-    "damaged transforms.json": (files("transforms.json"), "data of nerfstudio", "nerfstudio-data"),
+    "nerfstudio": (transforms(camera_model="OPENCV", frames=SHOTS, **CAMERA), "data of nerfstudio", "nerfstudio-data"),
     "NeRF synthetic": (
         transforms("transforms_train.json", camera_angle_x=0.7, frames=SYNTHETIC),
         "a synthetic scene of NeRF",
         "blender-data",
     ),
-    "D-NeRF": (
-        transforms("transforms_train.json", camera_angle_x=0.7, frames=TIMED),
-        "a scene of D-NeRF",
-        "dnerf-data",
-    ),
-    "Polycam": (
-        files("keyframes/images/1.jpg", "keyframes/cameras/1.json", "raw.glb"),
-        "a capture of Polycam",
-        "polycam",
-    ),
+    "Polycam": (files("keyframes/images/1.jpg", "raw.glb"), "a capture of Polycam", "polycam"),
     "Record3D": (files("rgb/0.jpg", "metadata.json"), "a capture of Record3D", "record3d"),
     "ScanNet": (
         files("color/0.jpg", "depth/0.png", "pose/0.txt", "intrinsic/intrinsic_color.txt"),
         "a scene of ScanNet",
         "scannet-data",
     ),
-    "ScanNet, packed": (files("scene0000_00.sens"), "a scene of ScanNet", "SensReader"),
     "ScanNet++": (files("dslr/nerfstudio/transforms.json"), r"a scene of ScanNet\+\+", "scannetpp-data"),
     "ARKitScenes": (files("1_frames/lowres_wide/0.png"), "a scene of ARKitScenes", "arkit-data"),
-    "7-Scenes": (
-        files("seq-01/frame-000000.color.png", "seq-01/frame-000000.pose.txt"),
-        "a scene of 7-Scenes",
-        "no parser of nerfstudio 1.1.5",
-    ),
-    "a sequence of 7-Scenes": (
-        files("frame-000000.color.png", "frame-000000.depth.png", "frame-000000.pose.txt"),
-        "a sequence of 7-Scenes",
-        "no parser of nerfstudio 1.1.5",
-    ),
-    "TUM": (
-        files("rgb.txt", "depth.txt", "groundtruth.txt", "rgb/1.png"),
-        "a sequence of the TUM RGB-D",
-        "no parser of nerfstudio",
-    ),
-    "LLFF": (files("poses_bounds.npy", "images/0.png"), "a scene of LLFF", "no parser of nerfstudio"),
     "SDFStudio": (files("meta_data.json", "0_rgb.png"), "a scene of SDFStudio", "sdfstudio-data"),
     "pictures": (files("DSC_1.jpg", "DSC_2.jpg"), "pictures without poses", "ns-process-data images"),
-    "rollouts": (lambda f: write_room(f / "r0", frames=1, heldout=1), "a folder of rollouts", "name one of them: .*r0"),
+    "rollouts": (lambda f: write_room(f / "r0", frames=1, heldout=1), "a folder of rollouts", "name one of them"),
     "a training": (files("config.yml", "nerfstudio_models/a.ckpt"), "a training of nerfstudio", "what --data takes"),
 }
 
@@ -169,16 +126,7 @@ def test_a_folder_of_another_tool_is_recognised_and_its_reader_named(tmp_path, k
 
 
 @pytest.mark.parametrize(
-    "kind",
-    [
-        "COLMAP in sparse/0",
-        "COLMAP in sparse",
-        "COLMAP of nerfstudio",
-        "nerfstudio",
-        "instant-ngp",
-        "NeRF synthetic",
-        "D-NeRF",
-    ],
+    "kind", ["COLMAP in sparse/0", "COLMAP in sparse", "COLMAP of nerfstudio", "nerfstudio", "NeRF synthetic"]
 )
 def test_the_parser_that_is_named_reads_the_folder(tmp_path, kind):
     FOLDERS[kind][0](tmp_path)
@@ -192,23 +140,17 @@ def test_the_parser_that_is_named_reads_the_folder(tmp_path, kind):
 def test_every_parser_and_converter_that_is_named_exists():
     from nerfstudio.scripts.process_data import Commands
 
-    from avp_nerfstudio.data import foreign
+    from avp_nerfstudio.data import refusals
 
-    text = " ".join(how for _, _, how in foreign._KINDS)
-    assert set(re.findall(r"parser ([\w-]+) ?", text.replace("no parser of", ""))) <= set(dataparsers)
+    text = " ".join(how for _, _, how in refusals._KINDS)
+    assert set(re.findall(r"parser ([\w-]+) ?", text)) <= set(dataparsers)
     converters = {note.name for kind in typing.get_args(Commands) for note in getattr(kind, "__metadata__", ())}
     assert set(re.findall(r"converter (\w+)", text)) | {"images", "video"} <= converters
 
 
-@pytest.mark.parametrize("model", ["sparse/0", "colmap/sparse/0", "model"])
-def test_the_folder_of_a_colmap_model_itself_is_recognised(tmp_path, model):
-    colmap(tmp_path, model)
-    assert f"--data {tmp_path} --colmap-path {model}`" in refusal(tmp_path / model)
-
-
 @pytest.mark.parametrize(
     ("name", "what"),
-    [("room.glb", "a scene's mesh: take pictures in it first"), ("a.mp4", "a video"), ("transforms.json", "data of ")],
+    [("room.glb", "a scene's mesh: take pictures in it first"), ("a.mp4", "a video"), ("a.MOV", "a video")],
 )
 def test_a_file_of_another_tool_is_recognised(tmp_path, name, what):
     put(tmp_path, name)
@@ -230,5 +172,7 @@ def test_what_is_nothing_known_is_told_what_was_expected(tmp_path):
 
 def test_a_relative_path_that_leads_nowhere_says_what_it_is_relative_to(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(RolloutError, match=f"^r0: expected a rollout folder .*; the path is relative to {tmp_path}$"):
+    with pytest.raises(
+        RolloutError, match=f"^r0: expected a rollout folder .*; the path is relative to .* now {tmp_path}$"
+    ):
         AVPDataParserConfig(data=Path("r0")).setup().get_dataparser_outputs()

@@ -24,8 +24,8 @@ import avp_nerfstudio.log
 from avp_habitat import command
 from avp_habitat.rollout.images import read_rgb
 from avp_nerfstudio.data.dataparser import AVPDataParserConfig
-from avp_nerfstudio.data.heldout import HeldoutView, error_colours, render_views, triptych
-from avp_nerfstudio.tracking.trained_run import open_trained, read_config
+from avp_nerfstudio.method.checkpoints import open_trained, read_config
+from avp_nerfstudio.method.scores import HeldoutView, error_colours, render_views, triptych
 
 SIZE = (64, 48)
 
@@ -232,13 +232,13 @@ def test_a_rollout_that_has_gone_is_named(copy, capsys):
     assert "- room\n" in text
     copy.write_text(text.replace("- room\n", "- gone\n"))
     assert log(copy, "--mlflow", "off") == 1
-    assert "gone: expected the rollout of" in capsys.readouterr().err.splitlines()[-1]
+    assert "gone: expected a rollout folder" in capsys.readouterr().err.splitlines()[-1]
 
 
 @pytest.mark.parametrize(
     ("options", "code", "text"),
     [
-        (["--pictures", "-1"], 2, "--pictures: expected a number from 0, got -1"),
+        (["--pictures", "-1"], 2, "--pictures: expected a whole number from 0 to 1e+09, got -1"),
         (["--rerun", __file__], 2, "exists already"),
         (["--output", __file__], 2, "cannot make this folder"),
         (["--mlflow", "nonsense://host"], 1, "MLflow at nonsense://host cannot be used"),

@@ -21,9 +21,9 @@ from nerfstudio_training import tiny_config, train
 from avp_habitat import command
 from avp_habitat.tracking import deliver
 from avp_habitat.tracking.journal import spool_folder
-from avp_nerfstudio.method.trainer import AVPTrainer, TrainingError
-from avp_nerfstudio.tracking.facts import Facts
-from avp_nerfstudio.tracking.mlflow import open_again, open_run, remembered_id
+from avp_nerfstudio.data.refusals import CommandError
+from avp_nerfstudio.method.trainer import AVPTrainer
+from avp_nerfstudio.tracking.mlflow import Facts, open_again, open_run, remembered_id
 
 TINY = ["--pipeline.datamanager.train-num-rays-per-batch", 64, "--pipeline.model.log2-hashmap-size", 8]
 OFTEN = ["--logging.steps-per-log", 5, "--logging.local-writer.enable", "False", "--steps-per-save", 20]
@@ -64,7 +64,7 @@ def test_a_training_goes_on_without_its_server_when_told_to_and_everything_is_se
 ):
     address = f"http://127.0.0.1:{free_port()}"
     config = tiny_config(room, tmp_path / "out", mlflow=address)
-    with pytest.raises(TrainingError, match=f"MLflow at {address} cannot be used.* AVP_MLFLOW_OFFLINE=1$"):
+    with pytest.raises(CommandError, match=f"MLflow at {address} cannot be used.* AVP_MLFLOW_OFFLINE=1$"):
         train(config)
     assert not list((tmp_path / "out").rglob("*.ckpt"))
     monkeypatch.setenv("AVP_MLFLOW_OFFLINE", "1")

@@ -7,13 +7,16 @@ import re
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import is_dataclass
 from pathlib import Path
+from types import ModuleType
+from typing import get_type_hints
 
 import numpy as np
 import pytest
 from replica_layout import replica_layout
 
-from avp_habitat import collect
+from avp_habitat import collect, command
 from avp_habitat.rollout.format import read_rollout
 from avp_habitat.scenes.loader import load_scene
 from avp_habitat.scenes.location import locate
@@ -137,13 +140,22 @@ def program_of(call: list[str]) -> tuple[str, list[str]]:
     return (call[2], call[3:]) if call[1] == "-m" else (call[1], call[2:])
 
 
+def read(program: ModuleType, own: list[str]) -> None:
+    """Have a program read its words."""
+    kind = next(iter(get_type_hints(program.main).values()))
+    if is_dataclass(kind):
+        command.parse(kind, own)
+    else:
+        program._parser().parse_args(own)
+
+
 def test_the_programs_of_the_suite_know_every_option_of_the_page(place):
     from avp_sb3 import train
 
     calls = [program_of(call) for call in words(place)]
     for name, own in calls:
         if name not in ("ns-train", "ns-eval", "rl_zoo3"):
-            {"avp_sb3.train": train, **PROGRAMS}[name]._parser().parse_args(own)
+            read({"avp_sb3.train": train, **PROGRAMS}[name], own)
     assert Counter(name for name, _ in calls) == {
         "avp_sb3.train": 4,
         "avp_sb3.evaluate": 5,
@@ -162,7 +174,7 @@ def test_a_policy_is_evaluated_captured_and_compared_in_room_2_as_the_page_says(
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "sqlite:///mlflow.db")
     for name, own in map(program_of, words(place)):
         if "replica_v1/room_2" in own or "runs/replica/comparison/room_2" in own:
-            PROGRAMS[name].main(own)
+            assert command.run(PROGRAMS[name].main, own) == 0
     assert read_rollout(place / "runs" / "replica" / "room_2" / "proposed").meta["scene"]["name"] == "room_2"
     kinds = {
         (row[0], row[2]) for row in rows_of(place / "runs" / "replica" / "comparison" / "room_2") if row[1] == "room_2"

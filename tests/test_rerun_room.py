@@ -8,7 +8,8 @@ from rrd import chunks, verify
 
 from avp_habitat import poses
 from avp_habitat.poses import Intrinsics
-from avp_sb3.rerun.room import log_room, room_points, room_poses
+from avp_sb3.rerun.environments import room_poses
+from avp_sb3.rerun.room import log_room, room_points
 
 CAMERA = Intrinsics.from_hfov(24, 16, hfov_deg=80)
 
@@ -104,22 +105,12 @@ def test_large_pictures_are_thinned_without_shifting_the_room():
     np.testing.assert_allclose(distance[0], depth[row, column], atol=1e-4)
 
 
-def test_sizes_that_do_not_fit_are_refused(views):
-    frames, pose = views
-    with pytest.raises(ValueError, match=r"expected frames of 24x16 pixels, got a picture of shape \(12, 16, 3\)"):
-        room_points([(np.zeros((12, 16, 3), np.uint8), np.zeros((12, 16)))], CAMERA, pose[:1])
-    with pytest.raises(ValueError, match="zip"):
-        room_points(frames[:2], CAMERA, pose)
-    with pytest.raises(ValueError, match=r"above 0, got voxel_m=0.05, at_most=0"):
-        room_points(frames, CAMERA, pose, at_most=0)
-
-
 def test_the_room_is_static_in_the_recording(views, tmp_path):
     frames, pose = views
     points, colours = room_points(frames, CAMERA, pose)
     recording = rr.RecordingStream("avp")
     recording.save(tmp_path / "a.rrd")
-    log_room(recording, "world/room", points, colours)
+    log_room(recording, "world/room", (points, colours))
     recording.disconnect()
     verify(tmp_path / "a.rrd")
     room = [chunk for chunk in chunks(tmp_path / "a.rrd") if chunk.entity_path == "/world/room"]
@@ -134,7 +125,7 @@ def test_the_room_is_static_in_the_recording(views, tmp_path):
 
 def test_views_of_a_room_stand_apart_where_an_agent_can_and_look_all_around():
     area: Any = Corridor().area
-    pose = room_poses(area, sensor_height_m=1.2, places=6)
+    pose = room_poses(area, 1.2, places=6)
     assert pose.shape == (18, 4, 4)
     assert all(poses.rigidity_fault(each) is None for each in pose)
     np.testing.assert_allclose(pose[:, 1, 3], 1.2)
@@ -147,4 +138,4 @@ def test_views_of_a_room_stand_apart_where_an_agent_can_and_look_all_around():
     assert (places[:, 0] > 3.1).any()
     yaw, _ = poses.yaw_and_pitch(pose[:3])
     np.testing.assert_allclose(np.diff(np.sort(yaw)), 2 * np.pi / 3, atol=1e-9)
-    np.testing.assert_array_equal(pose, room_poses(area, sensor_height_m=1.2, places=6))
+    np.testing.assert_array_equal(pose, room_poses(area, 1.2, places=6))

@@ -13,10 +13,10 @@ from avp_habitat.rollout.capture import capture_step, publish_rollout
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.rewards import (
-    REWARD_NAMES,
     REWARDS,
     RewardConstants,
     StepFacts,
+    find_reward,
     has_stop,
     reward_parts,
     stops_episode,
@@ -24,8 +24,7 @@ from avp_habitat.task.rewards import (
 from avp_habitat.task.settings import TaskSettings
 from avp_sb3 import AVPVecEnv
 from avp_sb3.callbacks.metrics import EpisodeWindow
-from avp_sb3.rerun.recording import write_rollout_recording
-from avp_sb3.rerun.rollout import Steps
+from avp_sb3.rerun.rollout import read_steps, write_rollout_recording
 
 # All different and none a special value, so that a swapped or forgotten constant changes a sum.
 CONSTANTS = RewardConstants(
@@ -86,18 +85,18 @@ def by_hand(name, facts, i):
     return new | {"spread": spread, "step": -c.step, "collision": collision, "redundancy": redundancy, "stop": stop}
 
 
-@pytest.mark.parametrize("name", REWARD_NAMES)
+@pytest.mark.parametrize("name", REWARDS)
 @given(seed=st.integers(0, 100_000))
 def test_every_part_equals_the_formula_by_hand(name, seed):
     facts = random_facts(seed)
-    parts = reward_parts(name, facts, CONSTANTS)
+    parts = reward_parts(find_reward(name), facts, CONSTANTS)
     for i in range(len(facts.coverage)):
         expected = by_hand(name, facts, i)
         assert {part: values[i] for part, values in parts.items()} == pytest.approx(expected)
 
 
 def test_only_the_proposed_and_the_surface_reward_have_a_stop():
-    assert [name for name in REWARD_NAMES if has_stop(name)] == ["proposed", "surface"]
+    assert [name for name in REWARDS if has_stop(find_reward(name))] == ["proposed", "surface"]
 
 
 def test_stopping_needs_the_choice_and_the_coverage():
@@ -116,7 +115,7 @@ def test_the_default_constants_follow_the_design():
 
 def test_an_unknown_reward_names_the_nearest():
     with pytest.raises(UsageError, match=r"unknown reward 'covrage': .* did you mean 'coverage'"):
-        reward_parts("covrage", random_facts(0), CONSTANTS)
+        TaskSettings(reward="covrage")
 
 
 def of_ones_own(facts, constants):
@@ -126,9 +125,8 @@ def of_ones_own(facts, constants):
 
 
 @pytest.fixture
-def own_reward(monkeypatch):
-    monkeypatch.setitem(REWARDS, "own", of_ones_own)
-    return TaskSettings(reward="own", budget=12, width=16, height=12)
+def own_reward():
+    return TaskSettings(reward=of_ones_own, budget=12, width=16, height=12)
 
 
 WALK_INTO_A_WALL = [0] * 11 + [1]
@@ -171,7 +169,7 @@ def test_a_rollout_holds_the_parts_by_their_names_also_those_of_later_steps_only
             _, reward, _, _, info = env.step(action)
             capture_step(env, writer, action, reward, info)
         publish_rollout(env, writer, info, policy={"name": "a list"}, seed=0, heldout=0)
-    plots = Steps(tmp_path / "r" / "steps.csv", frames=12).plots()
+    plots, _ = read_steps(tmp_path / "r" / "steps.csv", frames=12)
     parts = {name.removeprefix("reward/"): values for name, values in plots.items() if name.startswith("reward/")}
     total = parts.pop("sum")
     assert set(parts) == {"look, around", "time", "blocked/twice"}
@@ -194,24 +192,35 @@ def test_metrics_of_a_training_hold_each_part_also_one_that_shows_up_later(own_r
     assert means["reward/time"] == pytest.approx(-1.0)
 
 
-def test_a_part_that_is_no_number_for_each_agent_is_named(monkeypatch):
-    monkeypatch.setitem(REWARDS, "own", lambda facts, constants: {"pair": np.zeros((6, 2))})
-    with pytest.raises(UsageError, match=r"own: part 'pair': expected one number for each of 6 agents, got .*\(6, 2\)"):
-        reward_parts("own", random_facts(0), CONSTANTS)
-
-
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
+        ({"pair": np.zeros((6, 2))}, r"part 'pair': expected one number for each of 6 agents, got shape \(6, 2\)"),
+        ({"few": np.zeros(5)}, r"part 'few': expected one number for each of 6 agents, got shape \(5,\)"),
         ({"time": None}, "part 'time': expected finite numbers, got None"),
         ({"time": np.array([0, np.nan, 0, 0, 0, 0])}, "part 'time': expected finite numbers"),
         ({"time": np.inf}, "part 'time': expected finite numbers, got inf"),
         ({"time": "much"}, "part 'time': expected numbers, got 'much'"),
         ({"time": [[1], [1, 2]]}, "part 'time': expected numbers, got"),
         (np.ones(6), "expected parts by name, .*, got ndarray"),
+        ({}, "expected parts by name, .*, got none"),
     ],
 )
-def test_what_cannot_be_added_up_is_named(monkeypatch, parts, message):
-    monkeypatch.setitem(REWARDS, "own", lambda facts, constants: parts)
-    with pytest.raises(UsageError, match=rf"reward own: {message}"):
-        reward_parts("own", random_facts(0), CONSTANTS)
+def test_what_cannot_be_added_up_is_named(parts, message):
+    def own(facts, constants):
+        return parts
+
+    with pytest.raises(UsageError, match=rf"reward test_rewards:.*own: {message}"):
+        reward_parts(own, random_facts(0), CONSTANTS)
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        (lambda facts: {}, "expected a function of .facts, constants., got .*: too many positional arguments"),
+        (3, "reward 'builtins:int': expected a function"),
+    ],
+)
+def test_what_is_no_reward_is_refused_before_a_scene_is_opened(own, message):
+    with pytest.raises(UsageError, match=message):
+        TaskSettings(reward=own)

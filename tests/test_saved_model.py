@@ -1,15 +1,18 @@
 import os
 import pickle
+import re
 import shutil
 import struct
+import sys
 import zipfile
 from collections import deque
 
 import numpy as np
 import pytest
+import sb3_contrib
 from corridor import Corridor
 from mlflow import MlflowClient
-from stable_baselines3 import DQN, PPO
+from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
@@ -212,7 +215,7 @@ def test_a_damaged_model_is_named(tmp_path, damage):
         texts = {"bytes": data.replace('":serialized:": "', '":serialized:": "AAAA', 1), "half": data[: len(data) // 2]}
         for name in whole.namelist():
             changed.writestr(name, texts.get(damage, "[1]") if name == "data" else whole.read(name))
-    with pytest.raises(PolicyError, match=r"m\.zip: expected a PPO model of Stable-Baselines3, could not load it"):
+    with pytest.raises(PolicyError, match=r"m\.zip: expected a model of .*, could not load it"):
         make_policy(str(tmp_path / "m.zip"), SmallEnv(), 0)
 
 
@@ -286,7 +289,50 @@ def test_looking_at_a_forged_pickle_makes_nothing(tmp_path, make):
     assert not hasattr(LinearSchedule, "evil")
 
 
-def test_a_model_of_another_algorithm_is_named(tmp_path):
-    DQN("MlpPolicy", SmallEnv(), buffer_size=64, learning_starts=8, device="cpu").learn(16).save(tmp_path / "d.zip")
-    with pytest.raises(PolicyError, match=r"d\.zip: expected a PPO model of .*, found one with .*DQNPolicy"):
-        make_policy(str(tmp_path / "d.zip"), SmallEnv(), 0)
+OFF_POLICY = {"buffer_size": 64, "learning_starts": 8}
+
+
+@pytest.mark.parametrize(
+    ("kind", "policy", "options"),
+    [
+        (A2C, "MlpPolicy", {}),
+        (DQN, "MlpPolicy", OFF_POLICY),
+        (sb3_contrib.QRDQN, "MlpPolicy", OFF_POLICY),
+        (sb3_contrib.TRPO, "MlpPolicy", {"n_steps": 8}),
+        (sb3_contrib.RecurrentPPO, "MlpLstmPolicy", {"n_steps": 8}),
+        (sb3_contrib.ARS, "LinearPolicy", {"n_delta": 1}),
+    ],
+)
+def test_a_model_of_each_algorithm_acts_as_it_was_saved(tmp_path, kind, policy, options):
+    model = kind(policy, SmallEnv(), device="cpu", seed=0, **options).learn(16)
+    model.save(tmp_path / "m.zip")
+    loaded = make_policy(str(tmp_path / "m.zip"), SmallEnv(), 0)
+    assert type(loaded) is kind
+    found, expected = (each.predict(OBSERVATIONS, deterministic=True)[0] for each in (loaded, model))
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_a_file_that_does_not_tell_its_algorithm_is_opened_by_its_name(tmp_path):
+    ppo().learn(64).save(tmp_path / "whole.zip")
+    with zipfile.ZipFile(tmp_path / "whole.zip") as whole, zipfile.ZipFile(tmp_path / "m.zip", "w") as changed:
+        for name in whole.namelist():
+            text = whole.read(name)
+            changed.writestr(name, re.sub(rb'"(clip_range|gae_lambda)"', rb'"x_\1"', text) if name == "data" else text)
+    with pytest.raises(PolicyError, match=r"m\.zip: .*found one of stable_baselines3.*if it is, say which, as PPO:"):
+        make_policy(str(tmp_path / "m.zip"), SmallEnv(), 0)
+    assert type(make_policy(f"PPO:{tmp_path}/m.zip", SmallEnv(), 0)) is PPO
+
+
+def test_statistics_beside_an_off_policy_model_are_its_own(tmp_path):
+    ready = VecNormalize(DummyVecEnv([SmallEnv]))
+    DQN("MlpPolicy", ready, device="cpu", **OFF_POLICY).learn(16).save(tmp_path / "m.zip")
+    assert statistics_of(tmp_path / "m.zip") is None
+    ready.save(str(tmp_path / "m_vecnormalize.pkl"))
+    assert statistics_of(tmp_path / "m.zip") == tmp_path / "m_vecnormalize.pkl"
+
+
+def test_the_package_that_a_model_needs_is_named(tmp_path, monkeypatch):
+    sb3_contrib.TRPO("MlpPolicy", SmallEnv(), device="cpu", n_steps=8).save(tmp_path / "m.zip")
+    monkeypatch.setitem(sys.modules, "sb3_contrib", None)
+    with pytest.raises(PolicyError, match=r"m\.zip: TRPO needs sb3_contrib; .* `pip install sb3-contrib`"):
+        make_policy(str(tmp_path / "m.zip"), SmallEnv(), 0)

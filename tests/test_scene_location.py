@@ -16,9 +16,9 @@ from avp_habitat.errors import AVPError, SceneError, UsageError
 from avp_habitat.poses import Intrinsics, axes_to_world, camera_to_world
 from avp_habitat.scenes.builtin.room import generate_room
 from avp_habitat.scenes.export import export_glb
-from avp_habitat.scenes.loader import Scene, load_scene, scene_digest
+from avp_habitat.scenes.loader import Scene, identify, load_scene
 from avp_habitat.scenes.location import locate
-from avp_habitat.scenes.mesh import TexturedMesh, say_once
+from avp_habitat.scenes.mesh import TexturedMesh, warn_once
 from avp_habitat.scenes.stage_config import Y_UP, Z_UP
 from avp_habitat.simulators.raycast import RaycastSimulator
 
@@ -379,7 +379,7 @@ def test_objects_are_counted_and_left_to_habitat(tmp_path):
     write(tmp_path / "b/flat.scene_instance.json", content)
     location = locate(f"{path}:flat")
     assert location.objects == 3
-    assert len(scene_digest(location)) == 64
+    assert len(identify(location)[0]) == 64
     with pytest.raises(SceneError, match=r"flat.scene_instance.json: has 3 objects .*; use --simulator habitat$"):
         load_scene(f"{path}:flat")
 
@@ -468,22 +468,22 @@ def test_the_digest_tells_axes_and_configs_apart(tmp_path):
     digests = set()
     for axes in ({}, {"up": [0, 0, 1], "front": [0, 1, 0]}, {"up": [1, 0, 0], "front": [0, 1, 0]}, {"margin": 0.5}):
         path = str(stage(tmp_path, **axes))
-        assert load_scene(path).digest == scene_digest(locate(path))
+        assert load_scene(path).digest == identify(locate(path))[0]
         digests.add(load_scene(path).digest)
     plain = load_scene(str(tmp_path / "mesh.ply"))
     assert len(digests | {plain.digest}) == 5
     assert plain.digest == hashlib.sha256((tmp_path / "mesh.ply").read_bytes()).hexdigest()
-    assert load_scene("builtin:3").digest == scene_digest(locate("builtin:3"))
+    assert load_scene("builtin:3").digest == identify(locate("builtin:3"))[0]
 
 
 def test_a_mesh_that_only_habitat_reads_has_a_digest_all_the_same(tmp_path):
     path = write(tmp_path / "a.gltf", {"asset": {"version": "2.0"}, "extensionsRequired": ["KHR_texture_basisu"]})
-    assert scene_digest(locate(str(path))) == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert identify(locate(str(path)))[0] == hashlib.sha256(path.read_bytes()).hexdigest()
     with pytest.raises(SceneError, match="requires the glTF extension KHR_texture_basisu"):
         load_scene(str(path))
     write(path, {"asset": {"version": "2.0"}, "extensionsRequired": ["EXT_other"]})
     with pytest.raises(SceneError, match="requires the glTF extension EXT_other"):
-        scene_digest(locate(str(path)))
+        identify(locate(str(path)))
 
 
 def test_the_digest_of_a_scene_does_not_depend_on_where_it_lies(room, tmp_path):
@@ -527,5 +527,5 @@ def test_whatever_a_config_holds_brings_a_scene_or_an_error_of_ours(tmp_path_fac
 
 def test_what_is_said_of_a_scene_is_said_once(caplog):
     for text in ("first", "second", "first"):
-        say_once("room.glb", text)
+        warn_once("room.glb", text)
     assert caplog.messages == ["room.glb: first", "room.glb: second"]

@@ -3,6 +3,7 @@
 import itertools
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,15 +14,13 @@ from avp_habitat.errors import SceneError, UsageError
 from avp_habitat.scenes.builtin.room import generate_room
 from avp_habitat.scenes.export import export_glb
 from avp_habitat.scenes.export import main as export
-from avp_habitat.scenes.loader import identify, load_scene
+from avp_habitat.scenes.loader import identify, load_scene, looks_z_up
 from avp_habitat.scenes.location import Frame, locate
 from avp_habitat.scenes.mesh import TexturedMesh
-from avp_habitat.scenes.placing import looks_z_up
 from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.task.env import AVPEnv
 from avp_nerfstudio.check.__main__ import main as check
 from avp_sb3 import AVPVecEnv, EvaluationCallback
-from avp_sb3.evaluation.policy import Contestant
 
 UTM = np.array([448000.123, 120.5, -5411000.377])
 
@@ -177,10 +176,15 @@ def upright_and_lying(mesh, yaw_deg):
     return replace(mesh, vertices=turned), replace(mesh, vertices=z_up(turned))
 
 
+@cache
+def generated(seed):
+    return generate_room(seed)
+
+
 @pytest.mark.parametrize("yaw_deg", [0, 90, 180, 270])
 @pytest.mark.parametrize("seed", [None, 0, 4])
 def test_a_room_on_its_side_is_recognised_and_one_that_stands_is_not(seed, yaw_deg):
-    upright, lying = upright_and_lying(mesh_of(room()) if seed is None else generate_room(seed), yaw_deg)
+    upright, lying = upright_and_lying(mesh_of(room()) if seed is None else generated(seed), yaw_deg)
     assert looks_z_up(lying)
     assert not looks_z_up(upright)
 
@@ -270,7 +274,7 @@ def test_a_stage_config_that_forgets_the_axes_is_named_with_what_to_write(tmp_pa
 
 
 def test_generated_rooms_are_y_up_whatever_is_said():
-    assert load_scene("builtin:0", up="z").digest == load_scene("builtin:0").digest
+    assert identify(locate("builtin:0", up="z")) == identify(locate("builtin:0"))
 
 
 @pytest.mark.parametrize(
@@ -308,7 +312,6 @@ def test_whatever_takes_scenes_takes_paths(tmp_path):
     env = AVPEnv("builtin:0")
     env.change_scene(path)
     assert (env.scene_name, env.scene) == ("a.obj", str(path))
-    assert Contestant("heuristic", path, env.settings).env.scene_name == "a.obj"
     for scenes in (path, [path, "builtin:1"]):
         EvaluationCallback(scenes)
     with pytest.raises(UsageError, match=r"expected each once, got .*a.obj again"):

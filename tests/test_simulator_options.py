@@ -73,7 +73,7 @@ def test_one_scene_of_several_spellings_is_one_simulator(tmp_path, monkeypatch):
 
 
 def test_several_scenes_in_a_simulator_for_one_are_refused_before_any_is_opened():
-    with pytest.raises(UsageError, match=r"AVPVecEnv: .* one simulator of 'habitat'.*AVPSubprocVecEnv"):
+    with pytest.raises(UsageError, match=r"AVPVecEnv: .* one 'habitat' simulator.*AVPSubprocVecEnv"):
         AVPVecEnv(["builtin:0", "builtin:1"], simulator="habitat")
 
 

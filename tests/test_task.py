@@ -7,7 +7,7 @@ from corridor import Corridor, hit_distance
 from avp_habitat import poses
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import pixel_directions
-from avp_habitat.task.rewards import RewardConstants, StepFacts, reward_parts
+from avp_habitat.task.rewards import RewardConstants, StepFacts, find_reward, reward_parts
 from avp_habitat.task.settings import (
     ACTION_NAMES,
     LOOK_DOWN,
@@ -89,7 +89,7 @@ class ByHand:
             coverage=np.array([self.coverage()]),
             steps_left=np.array([s.budget - self.t]),
         )
-        return facts, {name: float(part[0]) for name, part in reward_parts(s.reward, facts, c).items()}
+        return facts, {name: float(part[0]) for name, part in reward_parts(find_reward(s.reward), facts, c).items()}
 
     def observe(self):
         pose, _ = self.look()

@@ -7,7 +7,8 @@ import pytest
 from test_navigation import DEPTH, WALLS, WIDTH, area_of, box, caster, mesh_of, quad, reaches, room
 
 from avp_habitat.errors import SceneError
-from avp_habitat.navigation.area import NavigableArea, build_area
+from avp_habitat.navigation.area import NavigableArea
+from avp_habitat.navigation.build import build_area
 from avp_habitat.scenes.builtin.room import generate_room
 from avp_habitat.scenes.loader import Scene
 from avp_habitat.simulators.raycast import RaycastSimulator

@@ -19,7 +19,7 @@ from avp_habitat.simulators.habitat.installed import inspect_installation, requi
 
 LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"
 # One of the suite's kernels stands for all.
-_COMPILED = "import json; from avp_habitat.task.observations import draw as f; print(json.dumps(f.stats.cache_path))"
+_COMPILED = "import json; from avp_habitat.task.floor_map import draw as f; print(json.dumps(f.stats.cache_path))"
 _TORCH = (
     "import json, torch; there = torch.cuda.is_available(); "
     "print(json.dumps([torch.__version__, torch.version.cuda, torch.cuda.get_device_name() if there else None]))"

@@ -16,10 +16,26 @@ _REACH_CELLS = 8
 """How far floor heights are continued beyond the navigable cells: farther than an outline lies from its cells."""
 
 
-def build(
-    mesh: TexturedMesh, surface_below: SurfaceBelow, start: NDArray | None, settings: NavigationSettings
+def build_area(
+    mesh: TexturedMesh,
+    surface_below: SurfaceBelow,
+    *,
+    start: NDArray[np.floating] | None = None,
+    settings: NavigationSettings | None = None,
 ) -> NavigableArea:
-    """See `avp_habitat.navigation.area.build_area`."""
+    """The part of a mesh's floor on which an agent can stand, by Recast's rules as Habitat-Sim sets them.
+
+    Args:
+        mesh: metres, Y up; triangles may be wound either way round.
+        surface_below: casts rays straight down on the same mesh; gives the floor's true height, which voxels round up.
+        start: `(3,)` point in metres that selects the part nearest to it; without it the largest part is taken that is
+            not a roof (open to the sky and over another part).
+        settings: Habitat-Sim's defaults when left out.
+
+    Raises:
+        SceneError: no floor, or no place with room for an agent; the message names likely causes.
+    """
+    settings = settings or NavigationSettings()
     vertices, triangles = _used(mesh)
     check_size(vertices, settings)
     _check_floor(vertices, triangles, settings)
@@ -109,7 +125,7 @@ def area_in_outline(
             the floor by what their maker rounded up.
         surface_below: finds the scene's first surface straight below points, which come on few different heights.
         settings: of the cells.
-        bounds: `(2, 3)` least and greatest corner of the scene's mesh in metres: cells then lie where `build` lays
+        bounds: `(2, 3)` least and greatest corner of the scene's mesh in metres: cells then lie where `build_area` lays
             them; without, they begin at the outline.
 
     Raises:

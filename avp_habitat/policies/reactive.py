@@ -1,4 +1,4 @@
-"""The baseline that turns in place, walks on a little and turns again."""
+"""Policies that react to the newest view: `random`, `heuristic` and `spin`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,70 +6,40 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.policies.planning import FREE, UNKNOWN, KnownMap, PlanningPolicy, known_map
-from avp_habitat.policies.predicted_views import in_view, make_lens
+from avp_habitat.policies.planning import PlanningPolicy, action_shape
 from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.settings import ACTION_NAMES, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT
 
-
-class Memory:
-    """Of one agent within one episode."""
-
-    def __init__(self) -> None:
-        """Remember nothing."""
-        self._stood = np.empty((0, 3))
-        self._misses = np.zeros((0, 0), dtype=np.uint8)
-        self._first = np.zeros(2, dtype=np.int64)
-
-    def update(self, view: AgentView) -> tuple[KnownMap, NDArray[np.uint8]]:
-        """Take in the newest view; call it once per step.
-
-        Returns:
-            The map, and `(rows, columns)` how many views should have observed a cell that is still not observed:
-            something stands there or hides it.
-        """
-        self._stood = np.concatenate([self._stood, view.position[None]])
-        known = known_map(view, self._stood)
-        misses = np.zeros_like(known.state)
-        row, column = np.maximum(self._first - known.first, 0)
-        height, width = self._misses.shape
-        misses[row : row + height, column : column + width] = self._misses
-        if view.steps:
-            missed = _should_see(view, known)
-            misses[tuple(missed.T)] = np.minimum(misses[tuple(missed.T)], 254) + 1
-        self._misses, self._first = misses, known.first
-        return known, misses
-
-
-def _should_see(view: AgentView, known: KnownMap) -> NDArray[np.int64]:
-    """`(k, 2)` cells not observed that the newest view should have shown."""
-    cells = np.argwhere((known.state == FREE) | (known.state == UNKNOWN))
-    row, column = known.at(view.position)
-    lens = make_lens(view.settings, known.cell_m)
-    return cells[in_view(known.state, cells, row, column, view.yaw, view.pitch, lens)]
-
-
 CLEARANCE_M = 1.0
 """The heuristic walks on while the depth at the image centre is above this (Eq. 23), metres."""
+WALK_M = 2.0
+"""Length of a walk between two full circles, metres."""
 
 
 class RandomPolicy:
     """Any of the six actions, with equal odds."""
 
-    def __init__(self, seed: int | None = None) -> None:
-        """Start a random generator of its own."""
+    def __init__(self, seed: int | None = None, agents: int | None = None) -> None:
+        """Start a random generator of its own.
+
+        Args:
+            seed: of it.
+            agents: n; where it is omitted, observations are arrays `(n, k)` or `(k,)`.
+        """
         self._rng = np.random.default_rng(seed)
+        self._agents = agents
 
     @classmethod
     def for_env(cls, env: Any, seed: int | None = None) -> "RandomPolicy":
-        """The random policy, which asks nothing of the environment."""
-        return cls(seed)
+        """The random policy for an `AVPEnv` or a vector environment of them."""
+        return cls(seed, getattr(env, "num_envs", 1))
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.int64], Any]:
         """Actions for `(n, 12)` observations, `(n,)`, or for one `(12,)` observation, `()`; the state is None."""
-        return self._rng.integers(len(ACTION_NAMES), size=np.shape(observation)[:-1]), None
+        shape = np.shape(observation)[:-1] if self._agents is None else action_shape(observation, self._agents)
+        return self._rng.integers(len(ACTION_NAMES), size=shape), None
 
 
 class HeuristicPolicy:
@@ -100,11 +70,7 @@ class HeuristicPolicy:
         depth = self._centre_depth()
         turn = np.where(self._rng.random(len(depth)) < 0.5, TURN_LEFT, TURN_RIGHT)
         action = np.where(depth > CLEARANCE_M, MOVE_FORWARD, turn).astype(np.int64)
-        return action.reshape(np.shape(observation)[:-1]), None
-
-
-WALK_M = 2.0
-"""Length of a walk between two full circles, metres."""
+        return action.reshape(action_shape(observation, len(depth))), None
 
 
 class SpinPlanner:

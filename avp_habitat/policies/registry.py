@@ -1,21 +1,29 @@
-"""One episode of a policy in `AVP-v0`, step by step."""
+"""The policies by name, and one episode of a policy in `AVP-v0`, step by step."""
 
 import importlib
-import zipfile
+import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.errors import PolicyError, UsageError, unknown_name
-from avp_habitat.policies.saved_model import SCHEDULES, NormalisedPolicy, check_harmless, statistics_of
+from avp_habitat import plugins
+from avp_habitat.errors import PolicyError, UsageError
+from avp_habitat.policies.saved_model import (
+    ALGORITHMS,
+    FOR_TRAINING,
+    NormalisedPolicy,
+    algorithm_of,
+    check_harmless,
+    statistics_of,
+)
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.task.env import AVPEnv
-from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
+from avp_habitat.task.settings import OBSERVATIONS, TaskSettings
 
 
 class MisfitError(PolicyError):
@@ -32,122 +40,164 @@ class Policy(Protocol):
         ...
 
 
-# Where each baseline's class lies; its `for_env(env, seed)` is imported when it is asked for.
-_BASELINES = {
-    "heuristic": "avp_habitat.policies.reactive:HeuristicPolicy",
-    "random": "avp_habitat.policies.reactive:RandomPolicy",
-    "spin": "avp_habitat.policies.reactive:SpinPolicy",
-    "frontier": "avp_habitat.policies.frontier:FrontierPolicy",
-    "greedy": "avp_habitat.policies.greedy:GreedyPolicy",
-    "oracle": "avp_habitat.policies.oracle.policy:OraclePolicy",
-    "survey": "avp_habitat.policies.oracle.policy:SurveyPolicy",
+POLICIES = {
+    "heuristic": "avp_habitat.policies.reactive:HeuristicPolicy.for_env",
+    "random": "avp_habitat.policies.reactive:RandomPolicy.for_env",
+    "spin": "avp_habitat.policies.reactive:SpinPolicy.for_env",
+    "frontier": "avp_habitat.policies.frontier:FrontierPolicy.for_env",
+    "greedy": "avp_habitat.policies.greedy:GreedyPolicy.for_env",
+    "oracle": "avp_habitat.policies.oracle.policy:OraclePolicy.for_env",
+    "survey": "avp_habitat.policies.oracle.policy:SurveyPolicy.for_env",
 }
-POLICY_NAMES = tuple(_BASELINES)
+"""The baselines by name: each is a function of (env, seed) that gives a `Policy`."""
+POLICIES_HELP = f"{', '.join(POLICIES)}, MODULE:OBJECT, or a model (.zip)"
+"""Help of the option `--policy`."""
 TRUSTED = "open a model also where that may run code which its file holds: only if you know who made it"
 """Help of the option `--trusted`."""
 
 
-def check_policy(policy: str) -> str:
-    """The name itself when it is a baseline's or an existing model file's that has its statistics.
+def check_policy(policy: Any) -> Any:
+    """The policy itself when there is such a one; a model's file has to have its statistics.
+
+    Args:
+        policy: as `make_policy` takes it.
 
     Raises:
-        UsageError: neither; the text names the nearest baseline.
+        UsageError: no such name, object or file; the text names the nearest name.
         PolicyError: the model was trained under `VecNormalize`, and its statistics are not beside it.
     """
-    if policy in _BASELINES:
-        return policy
-    if not policy.endswith(".zip"):
-        raise unknown_name("policy", policy, [*POLICY_NAMES, "MODEL.zip"])
-    if not Path(policy).is_file():
+    file = _model_file(policy)
+    if file is None:
+        if policy not in POLICIES:  # Those are imported by who makes one.
+            plugins.find("avp.policies", policy, POLICIES | {"MODEL.zip": ""})
+    elif not file.path.is_file():
         raise UsageError(f"--policy {policy}: no such model file")
-    statistics_of(Path(policy))
+    else:
+        statistics_of(file.path)
     return policy
 
 
-def described(policy: str) -> str:
+def described(policy: Any) -> str:
     """A policy as it will act, for the screen: with the statistics by which a model sees."""
-    statistics = statistics_of(Path(policy)) if policy.endswith(".zip") else None
-    return policy if statistics is None else f"{policy} with the statistics {statistics}"
+    file, name = _model_file(policy), plugins.name_of(policy)
+    statistics = None if file is None else statistics_of(file.path)
+    return name if statistics is None else f"{name} with the statistics {statistics}"
 
 
-def make_policy(policy: str, env: AVPEnv, seed: int, *, trusted: bool = False) -> Policy:
+class _ModelFile(NamedTuple):
+    path: Path
+    algorithm: str | None
+
+
+def _model_file(policy: Any) -> _ModelFile | None:
+    """Of `MODEL.zip` or `ALGORITHM:MODEL.zip`; None for what is no such text."""
+    if not isinstance(policy, str) or not policy.endswith(".zip"):
+        return None
+    algorithm, _, path = policy.partition(":")
+    return _ModelFile(Path(path), algorithm) if algorithm in ALGORITHMS else _ModelFile(Path(policy), None)
+
+
+def make_policy(policy: Any, env: AVPEnv, seed: int, *, trusted: bool = False) -> Policy:
     """The policy for an environment.
 
     Args:
-        policy: a baseline's name, or a PPO model saved by Stable-Baselines3 (`.zip`). One that was trained under
+        policy: a baseline's name, another distribution's, or `module:object`, which is (or the object itself) either
+            something with `predict`, or a class or function of (env, seed) that gives such a thing; what planners know
+            about the agents is `agent_view.agent_views(env)`. Or a model saved by Stable-Baselines3 or sb3-contrib,
+            `MODEL.zip`, or `ALGORITHM:MODEL.zip` where the file does not tell. One that was trained under
             `VecNormalize` sees observations normalised with the statistics beside it.
         env: what it acts in.
         seed: of a policy that draws at random.
         trusted: open a model's file also where that may run code which the file holds.
 
     Raises:
-        UsageError: no such policy.
+        UsageError: no such policy, or it is no policy.
         MisfitError: the model was trained for other observations or actions.
-        PolicyError: the file is not a PPO model, holds what may run code, or lacks its statistics.
+        PolicyError: the file is no such model, holds what may run code, or lacks its statistics.
     """
     check_policy(policy)
-    if policy in _BASELINES:
-        module, _, name = _BASELINES[policy].partition(":")
-        return getattr(importlib.import_module(module), name).for_env(env, seed)
-    model = load_model(Path(policy), trusted=trusted)
+    file = _model_file(policy)
+    if file is None:
+        return _made(policy, plugins.find("avp.policies", policy, POLICIES), env, seed)
+    model = load_model(file.path, algorithm=file.algorithm, trusted=trusted)
     for kind in ("observation_space", "action_space"):
         learned, offered = getattr(model, kind), getattr(env, kind)
         if learned != offered:
             raise MisfitError(f"{policy}: trained for the {kind} {learned}, but this environment has {offered}")
     model.set_random_seed(seed)
-    statistics = statistics_of(Path(policy))
+    statistics = statistics_of(file.path)
     return model if statistics is None else NormalisedPolicy(model, statistics, trusted=trusted)
 
 
-def load_model(path: Path, *, env: Any = None, trusted: bool = False) -> Any:
-    """A PPO model of Stable-Baselines3, on the CPU.
+def _made(policy: Any, found: Any, env: AVPEnv, seed: int) -> Policy:
+    name = plugins.name_of(policy)
+    what = f"policy {name!r}: expected something with `predict`, or a class or function of (env, seed)"
+    if isinstance(found, type) or not hasattr(found, "predict"):
+        try:
+            inspect.signature(found).bind(env, seed)
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"{what} that gives one: {error}") from None
+        found = found(env, seed)
+    if not callable(getattr(found, "predict", None)):
+        raise UsageError(f"{what} that gives one, got {type(found).__name__}")
+    return found
+
+
+def load_model(path: Path, *, env: Any = None, trusted: bool = False, algorithm: str | None = None) -> Any:
+    """A model of Stable-Baselines3 or sb3-contrib, on the CPU.
 
     Args:
         path: of its `.zip`.
         env: in which its training goes on; without it, its schedules (of the learning rate, say) are left unread, which
             are often functions.
         trusted: open it also where that may run code which the file holds.
+        algorithm: one of `ALGORITHMS`; what the file tells when omitted.
 
     Raises:
-        PolicyError: it is none, or holds what may run code.
+        PolicyError: it is none, needs a package that is not installed, or holds what may run code.
         ValueError: it does not fit `env`.
     """
-    try:
-        from stable_baselines3 import PPO
-    except ImportError:
-        raise PolicyError(f"{path}: needs stable-baselines3; install it with `pip install 'avp-suite[sb3]'`") from None
-    if not zipfile.is_zipfile(path):
-        raise PolicyError(f"{path}: expected a model saved by Stable-Baselines3 (.zip), found another kind of file")
+    kind = _algorithm(path, algorithm or algorithm_of(path))
     # Who only acts needs no schedules.
-    replaced = SCHEDULES if env is None and not trusted else {}
+    replaced = FOR_TRAINING if env is None and not trusted else {}
     if not trusted:
         check_harmless(path, without=replaced)
     try:
-        return PPO.load(path, env=env, device="cpu", custom_objects=replaced)
+        return kind.load(path, env=env, device="cpu", custom_objects=replaced)
     except Exception as error:
         if env is not None and isinstance(error, ValueError):
             raise
         # A pickle may raise anything.
-        raise PolicyError(f"{path}: expected a PPO model of Stable-Baselines3, could not load it: {error}") from None
+        raise PolicyError(f"{path}: expected a model of {kind.__name__}, could not load it: {error}") from None
+
+
+def _algorithm(path: Path, name: str) -> Any:
+    package = ALGORITHMS[name]
+    try:
+        return getattr(importlib.import_module(package), name)
+    except ImportError:
+        install = "'avp-suite[sb3]'" if package == "stable_baselines3" else package.replace("_", "-")
+        raise PolicyError(f"{path}: {name} needs {package}; install it with `pip install {install}`") from None
 
 
 def make_policy_env(
-    policy: str,
+    policy: Any,
     simulator: Simulator,
     settings: TaskSettings,
     *,
     seed: int = 0,
-    observation: str | None = None,
+    observation: Any = None,
     trusted: bool = False,
 ) -> tuple[AVPEnv, Policy]:
     """An environment, and the policy that acts in it.
 
     Args:
-        policy: a baseline's name, or a model saved by Stable-Baselines3 (`.zip`).
+        policy: as `make_policy` takes it.
         simulator: an open one.
         settings: of the task.
         seed: of a policy that draws at random.
-        observation: the kind; when omitted, the first one that fits: a baseline fits each, a model its own.
+        observation: the kind; when omitted, the first one that fits, of the settings' own, those that are built in and
+            those that other distributions register: a baseline fits each, a model its own.
         trusted: open a model's file also where that may run code which the file holds.
 
     Raises:
@@ -155,7 +205,8 @@ def make_policy_env(
         PolicyError: the model cannot be loaded, or fits no kind of observation.
     """
     first: MisfitError | None = None
-    for kind in OBSERVATION_NAMES if observation is None else (observation,):
+    every = [settings.observation, *plugins.names("avp.observations", OBSERVATIONS)]
+    for kind in every if observation is None else (observation,):
         env = AVPEnv(simulator.scene, simulator=simulator, settings=replace(settings, observation=kind))
         try:
             return env, make_policy(policy, env, seed, trusted=trusted)
@@ -192,7 +243,7 @@ def steps_of(env: gymnasium.Env, policy: Policy, *, seed: int, deterministic: bo
     ended = False
     while not ended:
         chosen, state = policy.predict(observation, state, first, deterministic=deterministic)
-        action = int(chosen)
+        action = int(np.asarray(chosen).item())
         observation, reward, terminated, truncated, info = env.step(action)
         first = np.array([False])
         ended = terminated or truncated

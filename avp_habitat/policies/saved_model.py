@@ -37,13 +37,23 @@ _KNOWN = {
     "pathlib": "Path PosixPath PurePosixPath WindowsPath",
     "pathlib._local": "Path PosixPath PurePosixPath WindowsPath",
     "rl_zoo3.utils": "SimpleLinearSchedule",
-    "stable_baselines3.common.buffers": "RolloutBuffer DictRolloutBuffer",
+    "sb3_contrib.ars.policies": "ARSLinearPolicy ARSPolicy",
+    "sb3_contrib.common.maskable.buffers": "MaskableDictRolloutBuffer MaskableRolloutBuffer",
+    "sb3_contrib.common.maskable.policies": "MaskableActorCriticCnnPolicy MaskableActorCriticPolicy "
+    "MaskableMultiInputActorCriticPolicy",
+    "sb3_contrib.common.recurrent.buffers": "RecurrentDictRolloutBuffer RecurrentRolloutBuffer",
+    "sb3_contrib.common.recurrent.policies": "RecurrentActorCriticCnnPolicy RecurrentActorCriticPolicy "
+    "RecurrentMultiInputActorCriticPolicy",
+    "sb3_contrib.qrdqn.policies": "CnnPolicy MultiInputPolicy QRDQNPolicy",
+    "stable_baselines3.common.buffers": "DictReplayBuffer DictRolloutBuffer ReplayBuffer RolloutBuffer",
     "stable_baselines3.common.policies": "ActorCriticPolicy ActorCriticCnnPolicy MultiInputActorCriticPolicy",
     "stable_baselines3.common.running_mean_std": "RunningMeanStd",
     "stable_baselines3.common.torch_layers": "CombinedExtractor FlattenExtractor NatureCNN",
     "stable_baselines3.common.sb2_compat.rmsprop_tf_like": "RMSpropTFLike",
+    "stable_baselines3.common.type_aliases": "TrainFreq TrainFrequencyUnit",
     "stable_baselines3.common.utils": "ConstantSchedule FloatSchedule LinearSchedule",
     "stable_baselines3.common.vec_env.vec_normalize": "VecNormalize",
+    "stable_baselines3.dqn.policies": "CnnPolicy DQNPolicy MultiInputPolicy",
     "torch.nn.modules.activation": "CELU ELU GELU Hardsigmoid Hardswish Hardtanh LeakyReLU LogSigmoid Mish PReLU RReLU "
     "ReLU ReLU6 SELU Sigmoid SiLU Softplus Softsign Tanh Tanhshrink",
     "torch.nn.modules.linear": "Identity",
@@ -58,12 +68,37 @@ _KNOWN = {
     "torch.optim.rmsprop": "RMSprop",
     "torch.optim.sgd": "SGD",
 }
-"""What PPO's own models and statistics are made of: making these objects does nothing else. All else may run code."""
-SCHEDULES = {"learning_rate": 0.0, "lr_schedule": None, "clip_range": 0.2, "clip_range_vf": None}
+"""What models and statistics are made of: making these objects does nothing else. All else may run code."""
+FOR_TRAINING = {
+    "learning_rate": 0.0,
+    "lr_schedule": None,
+    "clip_range": 0.2,
+    "clip_range_vf": None,
+    "exploration_schedule": None,
+    "delta_std_schedule": None,
+    "weights": None,
+    "buffer_size": 1,
+}
 """Of a model, what only its training reads, and what stands for it where a model only acts: often functions, which
-Stable-Baselines3 keeps as code."""
-_OTHERS = tuple(f"stable_baselines3.{each}." for each in ("ddpg", "dqn", "sac", "td3"))
-"""Modules of algorithms that are not like PPO."""
+Stable-Baselines3 keeps as code, tensors, and room for a replay buffer."""
+ALGORITHMS = {
+    **dict.fromkeys(("PPO", "A2C", "DQN"), "stable_baselines3"),
+    **dict.fromkeys(("RecurrentPPO", "MaskablePPO", "TRPO", "QRDQN", "ARS"), "sb3_contrib"),
+}
+"""Those that can choose among six actions, and the packages that have them."""
+# A file does not name its algorithm: the module of its policy does, or what only that algorithm has.
+_BY_POLICY = {
+    "sb3_contrib.common.recurrent.": "RecurrentPPO",
+    "sb3_contrib.common.maskable.": "MaskablePPO",
+    "sb3_contrib.ars.": "ARS",
+}
+_BY_KEY = {
+    "cg_damping": "TRPO",
+    "clip_range": "PPO",
+    "gae_lambda": "A2C",
+    "n_quantiles": "QRDQN",
+    "exploration_fraction": "DQN",
+}
 _PLAIN_TYPE = re.compile(r"[biufcSUO]\d+")
 _PICKLED = ":serialized:"
 _CHECKPOINT = re.compile(r"(?P<name>.+)_(?P<steps>\d+)_steps")
@@ -124,8 +159,6 @@ class _KnownObjects(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if name in _KNOWN.get(module, "").split():
             return type(name, (_NumpyType if (module, name) == ("numpy", "dtype") else _Nothing,), {})
-        if module.startswith(_OTHERS):
-            raise PolicyError(f"{self._path}: {_expected(self._path)}, found one with {module}.{name}")
         raise PolicyError(
             f"{self._path}: opening it would run code that it holds or names, found {module}.{name}; if you know "
             "who made it, open it with --trusted"
@@ -164,15 +197,38 @@ def _pickles(path: Path, without: Collection[str]) -> list[BinaryIO]:
 
 def _expected(path: Path) -> str:
     if path.suffix == ".zip":
-        return "expected a PPO model of Stable-Baselines3"
+        return f"expected a model of Stable-Baselines3 or sb3-contrib ({', '.join(ALGORITHMS)})"
     return "expected the statistics of Stable-Baselines3's VecNormalize"
 
 
-def is_normalised(path: Path) -> bool:
-    """Whether a model (`.zip`) was trained under `VecNormalize`; its pickles are not opened."""
+def algorithm_of(path: Path) -> str:
+    """One of `ALGORITHMS`, by a model's file; its pickles are not opened.
+
+    Raises:
+        PolicyError: it is of none of them, or does not tell.
+    """
+    if not zipfile.is_zipfile(path):
+        raise PolicyError(f"{path}: {_expected(path)}, found another kind of file")
     try:
         data = _data(path)
-        return _ON_POLICY in data and data.get(_TELLS_NORMALISED) is not None
+        module = str(data["policy_class"]["__module__"])
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise PolicyError(f"{path}: {_expected(path)}, could not load it: {error}") from None
+    told = [name for start, name in _BY_POLICY.items() if module.startswith(start)]
+    told += [name for key, name in _BY_KEY.items() if key in data]
+    if not told:
+        raise PolicyError(f"{path}: {_expected(path)}, found one of {module}; if it is, say which, as PPO:{path}")
+    return told[0]
+
+
+def is_normalised(path: Path) -> bool | None:
+    """Whether a model (`.zip`) was trained under `VecNormalize`; its pickles are not opened.
+
+    None where the file does not tell: off-policy algorithms and ARS.
+    """
+    try:
+        data = _data(path)
+        return data.get(_TELLS_NORMALISED) is not None if _ON_POLICY in data else None
     except (OSError, KeyError, TypeError, ValueError, AttributeError, zipfile.BadZipFile):
         return False
 
@@ -202,15 +258,17 @@ def statistics_names(path: Path) -> list[Path]:
 def statistics_of(path: Path) -> Path | None:
     """The file of the statistics that a model needs; None where it was not trained under `VecNormalize`.
 
+    A model that does not tell was, if there are such statistics beside it.
+
     Raises:
         PolicyError: it was, and none of them is there.
     """
-    if not is_normalised(path):
+    normalised, names = is_normalised(path), statistics_names(path)
+    if normalised is False:
         return None
-    names = statistics_names(path)
-    for found in names:
-        if found.is_file():
-            return found
+    found = next((name for name in names if name.is_file()), None)
+    if found is not None or normalised is None:
+        return found
     raise PolicyError(
         f"{path}: trained under VecNormalize, without whose statistics it acts blindly; expected one of "
         f"{', '.join(map(str, dict.fromkeys(names)))}"

@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 
 from avp_habitat import poses
 from avp_habitat.errors import SceneError
+from avp_habitat.metrics import measured
 from avp_habitat.navigation.area import NavigableArea
+from avp_habitat.plugins import name_of
 from avp_habitat.poses import Intrinsics
 from avp_habitat.provenance import installed_versions
 from avp_habitat.rollout.drawing import draw_trajectory
+from avp_habitat.rollout.format import Rollout
 from avp_habitat.rollout.images import write_numbers, write_rgb
 from avp_habitat.rollout.seen import visibility_of
 from avp_habitat.rollout.writing import RolloutWriter
@@ -23,9 +26,15 @@ from avp_habitat.task.settings import ACTION_NAMES
 from avp_habitat.task.trajectory import Trajectory
 
 VIEWS = 20
+"""Held-out views of a rollout."""
 PITCH_DEG = 20.0
+"""Their greatest pitch, either way."""
 MIN_MEAN_DEPTH_M = 1.0
+"""A view that sees no farther on average has its nose on a wall."""
+
 _TRIES = 2000
+_VERSIONED = ("avp-suite", "numpy", "gymnasium", "open3d", "pillow", "stable-baselines3", "torch")
+_FLOOR_FILE = "floor.png"
 
 
 def heldout_seed(scene_digest: str) -> int:
@@ -35,8 +44,6 @@ def heldout_seed(scene_digest: str) -> int:
 
 def heldout_poses(simulator: Simulator, *, sensor_height_m: float, views: int = VIEWS) -> NDArray[np.float64]:
     """Poses uniform over the navigable area, any yaw, pitch within ±20°, that see at least 1 m far on average.
-
-    A camera with its nose on a wall shows nothing that a reconstruction could be judged by, hence the last rule.
 
     Args:
         simulator: of the scene.
@@ -64,10 +71,6 @@ def heldout_poses(simulator: Simulator, *, sensor_height_m: float, views: int = 
         f"{simulator.scene}: found only {len(found)} of {views} held-out views that see at least "
         f"{MIN_MEAN_DEPTH_M} m far on average; is the scene in metres?"
     )
-
-
-_VERSIONED = ("avp-suite", "numpy", "gymnasium", "open3d", "pillow", "stable-baselines3", "torch")
-_FLOOR_FILE = "floor.png"
 
 
 def capture_step(env: AVPEnv, writer: RolloutWriter, action: int, reward: float, info: dict[str, Any]) -> None:
@@ -134,9 +137,11 @@ def publish_rollout(
     """
     write_rgb(writer.path("trajectory.png"), draw_trajectory(env.area, info["avp_trajectory"]))
     floor = _write_floor(env.area, info["avp_trajectory"], writer)
-    metrics = info["avp_episode"] | _visibility(writer)
+    frames, views = writer.views(heldout=False), writer.views(heldout=True)
+    rollout = Rollout(writer.path(""), _scene_and_task(env, heldout), writer.intrinsics, frames, views)
+    metrics = info["avp_episode"] | _visibility(rollout) | measured(env.settings.metrics, "rollout", rollout)
     about = {"policy": policy, "seed": seed, "metrics": metrics, "floor": floor, "mlflow_run_id": mlflow_run_id}
-    writer.publish(_scene_and_task(env, heldout) | about)
+    writer.publish(rollout.meta | about)
     return metrics
 
 
@@ -153,12 +158,11 @@ def _write_floor(area: NavigableArea, trajectory: Trajectory, writer: RolloutWri
     }
 
 
-def _visibility(writer: RolloutWriter) -> dict[str, float]:
+def _visibility(rollout: Rollout) -> dict[str, float]:
     """From the files, in whole millimetres, so that the figure is the one that a reader of the folder computes."""
-    heldout = writer.views(heldout=True)
-    if not heldout:
+    if not rollout.heldout:
         return {}
-    found = visibility_of(writer.views(heldout=False), heldout, writer.intrinsics).figures()
+    found = visibility_of(rollout.frames, rollout.heldout, rollout.intrinsics).figures()
     return {name: value for name, value in found.items() if name == "visibility"}
 
 
@@ -186,7 +190,7 @@ def _scene_and_task(env: AVPEnv, heldout: int) -> dict[str, Any]:
     return {
         "scene": {"name": env.scene_name, "sha256": env.scene_digest, **asdict(env.simulator.scene_frame)},
         "simulator": {"name": env.simulator.name, "version": env.simulator.version},
-        "reward": settings.reward,
+        "reward": name_of(settings.reward),
         "reward_constants": asdict(settings.constants),
         "budget": settings.budget,
         "actions": {

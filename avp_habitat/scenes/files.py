@@ -24,11 +24,7 @@ class SceneFiles:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the scene stored at `path`.
-
-        Raises:
-            SceneError: the file cannot be read, or has no byte.
-        """
+        """Read the scene's own file; SceneError where it cannot be read, or has no byte."""
         self.path = path
         self._folder = Path(os.path.abspath(path.parent))
         self._referenced: dict[str, bytes] = {}
@@ -77,15 +73,7 @@ class SceneFiles:
 
 
 def check_memory(name: str, needed: int) -> None:
-    """Refuse what would not fit into the memory that is free, before it is asked for.
-
-    Args:
-        name: of the file, and what in it is meant.
-        needed: bytes.
-
-    Raises:
-        SceneError: it does not fit.
-    """
+    """Refuse, by a SceneError that begins with `name`, what needs more bytes than are free, before they are taken."""
     try:
         free = 1024 * int(Path("/proc/meminfo").read_text().partition("MemAvailable:")[2].split()[0])
     except (OSError, LookupError):
@@ -116,9 +104,8 @@ def decode_picture(content: bytes, name: str, mode: str = "RGB") -> NDArray[np.u
 
     try:
         with Image.open(io.BytesIO(content)) as image:
-            check_memory(
-                f"{name}: its picture of {image.width} x {image.height} pixels", 8 * image.width * image.height
-            )
+            width, height = image.size
+            check_memory(f"{name}: its picture of {width} x {height} pixels", 8 * width * height)
             if image.mode.startswith("I"):
                 # Pillow clips 16-bit greys to 255 when it converts them, instead of scaling them.
                 grey = (np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8)

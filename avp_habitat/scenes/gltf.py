@@ -1,8 +1,10 @@
 """Reads glTF 2.0 (`.glb`, `.gltf`) into one TexturedMesh."""
 
+import base64
 import struct
 import warnings
 from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -11,10 +13,11 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles, check_memory, decode_picture
-from avp_habitat.scenes.gltf_data import SUPPORTED, Buffers, Surface, fractions, ignored, surface_of
-from avp_habitat.scenes.masks import only, with_mask
-from avp_habitat.scenes.mesh import TexturedMesh, merge, say_once
+from avp_habitat.scenes.gltf_materials import SUPPORTED, Surface, ignored, surface_of
+from avp_habitat.scenes.mesh import TexturedMesh, merge, only, warn_once, with_mask
 
+_COMPONENT = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _REPEAT = 10497
 _EDGE = 0.01
@@ -22,17 +25,8 @@ _EDGE = 0.01
 _VERTEX_BYTES, _CORNER_BYTES = 160, 30
 """What reading takes at most for each vertex and each triangle's corner, copies included."""
 # What walking through a document raises where a field is missing, of another type or out of range.
-_MALFORMED = (
-    ArithmeticError,
-    AttributeError,
-    LookupError,
-    MemoryError,
-    OSError,
-    RecursionError,
-    TypeError,
-    ValueError,
-    struct.error,
-)
+_MALFORMED = (ArithmeticError, AttributeError, LookupError, MemoryError, OSError, RecursionError, TypeError)
+_MALFORMED += (ValueError, struct.error)
 
 
 def read_gltf(files: SceneFiles) -> TexturedMesh:
@@ -47,8 +41,7 @@ def read_gltf(files: SceneFiles) -> TexturedMesh:
     try:
         return _Reader(files).mesh()
     except _MALFORMED as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise SceneError(f"{files.path}: expected a valid glTF 2.0 file, but it is damaged: {reason}") from error
+        raise _damaged(files, error) from error
 
 
 def shown_as_it_is(files: SceneFiles) -> bool:
@@ -66,9 +59,105 @@ def shown_as_it_is(files: SceneFiles) -> bool:
         surfaces = [surface_of(material) for material in document.materials or []]
         mirrored = any(np.linalg.det(_local_transform(node)[:3, :3]) < 0 for node in document.nodes)
     except _MALFORMED as error:
-        raise SceneError(f"{files.path}: expected a valid glTF 2.0 file, but it is damaged: {error}") from error
+        raise _damaged(files, error) from error
     foreign = set(document.extensionsRequired or []) - SUPPORTED
     return bool(foreign) or (not mirrored and all(surface.cutoff is None and surface.tinted for surface in surfaces))
+
+
+def _damaged(files: SceneFiles, error: Exception) -> SceneError:
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return SceneError(f"{files.path}: expected a valid glTF 2.0 file, but it is damaged: {reason}")
+
+
+class _Buffers:
+    """The accessors and buffer views of one document, each buffer read once."""
+
+    def __init__(self, document: pygltflib.GLTF2, files: SceneFiles) -> None:
+        self._document, self._files = document, files
+        self._content: dict[int, bytes] = {}
+
+    def resolve(self, uri: str) -> bytes:
+        """Bytes of a data URI or of a file in the scene's folder."""
+        if not uri.startswith("data:"):
+            return self._files.read(uri)
+        header, _, payload = uri.partition(",")
+        if not header.endswith(";base64"):
+            raise SceneError(f"{self._files.path}: expected a base64 data URI, got {header[:40]!r}")
+        try:
+            return base64.b64decode(payload, validate=True)
+        except ValueError as error:
+            raise SceneError(f"{self._files.path}: a data URI is damaged: {error}") from error
+
+    def view(self, index: int) -> memoryview:
+        """Bytes of a buffer view."""
+        view = self._document.bufferViews[index]
+        content = self._buffer(view.buffer)
+        start = view.byteOffset or 0
+        if start < 0 or view.byteLength < 0 or start + view.byteLength > len(content):
+            raise SceneError(
+                f"{self._files.path}: truncated: buffer view {index} ends at byte {start + view.byteLength} "
+                f"of a buffer with {len(content)} bytes"
+            )
+        return memoryview(content)[start : start + view.byteLength]
+
+    def array(self, index: int) -> NDArray:
+        """An accessor as `(count, width)`; normalised integers become float32 in [0, 1] or [-1, 1]."""
+        accessor = self._document.accessors[index]
+        if accessor.componentType not in _COMPONENT or accessor.type not in _WIDTH:
+            raise SceneError(
+                f"{self._files.path}: accessor {index} has component type {accessor.componentType} and type "
+                f"{accessor.type}; expected one of {sorted(_COMPONENT)} and one of {', '.join(_WIDTH)}"
+            )
+        dtype, shape = np.dtype(_COMPONENT[accessor.componentType]), (accessor.count, _WIDTH[accessor.type])
+        if accessor.bufferView is not None:
+            values = self._dense(index, dtype, shape)
+        else:
+            # This costs no byte of the file, so that the count may be anything.
+            most = sum(len(self._buffer(buffer)) for buffer in range(len(self._document.buffers)))
+            if shape[0] > most:
+                raise SceneError(
+                    f"{self._files.path}: accessor {index} claims {shape[0]} elements without any data for them, in a "
+                    f"file whose buffers hold {most} bytes"
+                )
+            values = np.zeros(shape, dtype)
+        if accessor.sparse is not None:
+            values = self._with_sparse(accessor.sparse, values.copy())
+        return _fractions(values) if accessor.normalized else values
+
+    def _with_sparse(self, sparse: Any, values: NDArray) -> NDArray:
+        (where, what), count = (sparse.indices, sparse.values), sparse.count
+        rows = np.frombuffer(self.view(where.bufferView), _COMPONENT[where.componentType], count, where.byteOffset or 0)
+        new = np.frombuffer(self.view(what.bufferView), values.dtype, count * values.shape[1], what.byteOffset or 0)
+        values[rows] = new.reshape(count, -1)
+        return values
+
+    def _buffer(self, index: int) -> bytes:
+        if index not in self._content:
+            uri = self._document.buffers[index].uri
+            content = self.resolve(uri) if uri else self._document.binary_blob()
+            if content is None:
+                raise SceneError(f"{self._files.path}: truncated: buffer {index} has neither a uri nor a binary chunk")
+            self._content[index] = content
+        return self._content[index]
+
+    def _dense(self, index: int, dtype: np.dtype, shape: tuple[int, int]) -> NDArray:
+        accessor = self._document.accessors[index]
+        stride = self._document.bufferViews[accessor.bufferView].byteStride or dtype.itemsize * shape[1]
+        data, offset = self.view(accessor.bufferView), accessor.byteOffset or 0
+        end = offset + (shape[0] - 1) * stride + dtype.itemsize * shape[1]
+        if shape[0] < 1 or offset < 0 or end > len(data):
+            raise SceneError(
+                f"{self._files.path}: truncated: accessor {index} needs {shape[0]} elements up to byte {end} "
+                f"of a buffer view with {len(data)} bytes"
+            )
+        return np.ndarray(shape, dtype, data, offset, (stride, dtype.itemsize))
+
+
+def _fractions(values: NDArray) -> NDArray:
+    """Integers as fractions of their type's greatest value (glTF 2.0, section 3.11: -128 and -127 are both -1)."""
+    if values.dtype.kind == "f":
+        return values
+    return np.maximum(values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max), np.float32(-1.0))
 
 
 class _Reader:
@@ -77,9 +166,9 @@ class _Reader:
     def __init__(self, files: SceneFiles) -> None:
         self._path = files.path
         self._document = _parse(files.main)
-        self._buffers = Buffers(self._document, files)
-        self._pictures: dict[int, NDArray[np.uint8]] = {}
-        self._masks: dict[tuple[int, float], NDArray[np.bool_]] = {}
+        self._buffers = _Buffers(self._document, files)
+        # The same object for the same picture, which is kept once then.
+        self._picture, self._mask = cache(self._decode), cache(self._read_mask)
         version = str(self._document.asset.version)
         if not version.startswith("2."):
             raise SceneError(f"{files.path}: expected glTF 2.0, got version {version}")
@@ -93,40 +182,34 @@ class _Reader:
     def mesh(self) -> TexturedMesh:
         """All triangles of the default scene, placed in the world."""
         if phrases := ignored(self._document):
-            say_once(str(self._path), "; ".join(phrases))
-        placed = [
-            (primitive, to_world)
-            for mesh, to_world in self._placed_meshes()
-            for primitive in self._document.meshes[mesh].primitives
-        ]
+            warn_once(str(self._path), "; ".join(phrases))
+        placed = list(self._placed())
         # A small file can name the same vertices again and again.
         check_memory(f"{self._path}: its mesh", sum(self._bytes_of(primitive) for primitive, _ in placed))
         parts = [part for each in placed if (part := self._primitive(*each)) is not None]
-        if not parts:
-            raise SceneError(f"{self._path}: expected a mesh with triangles, found none in the default scene")
-        return merge(parts)
+        if parts:
+            return merge(parts)
+        raise SceneError(f"{self._path}: expected a mesh with triangles, found none in the default scene")
 
-    def _roots(self) -> list[int]:
-        document = self._document
-        if document.scenes:
-            return document.scenes[document.scene or 0].nodes or []
-        children = {child for node in document.nodes for child in node.children or []}
-        return [index for index in range(len(document.nodes)) if index not in children]
-
-    def _placed_meshes(self) -> Iterator[tuple[int, NDArray]]:
-        """Mesh indices with their `(4, 4)` transforms to the world, in document order."""
-        waiting = [(root, np.eye(4)) for root in reversed(self._roots())]
+    def _placed(self) -> Iterator[tuple[pygltflib.Primitive, NDArray]]:
+        """Primitives with their `(4, 4)` transforms to the world, in document order."""
+        nodes, scenes = self._document.nodes, self._document.scenes
+        if scenes:
+            roots = scenes[self._document.scene or 0].nodes or []
+        else:
+            children = {child for node in nodes for child in node.children or []}
+            roots = [index for index in range(len(nodes)) if index not in children]
+        waiting = [(root, np.eye(4)) for root in reversed(roots)]
         seen: set[int] = set()
         while waiting:
             index, parent = waiting.pop()
             if index in seen:
                 raise SceneError(f"{self._path}: node {index} has two parents; expected a tree of nodes")
             seen.add(index)
-            node = self._document.nodes[index]
-            to_world = parent @ _local_transform(node)
-            if node.mesh is not None:
-                yield node.mesh, to_world
-            waiting += [(child, to_world) for child in reversed(node.children or [])]
+            to_world = parent @ _local_transform(nodes[index])
+            if (mesh := nodes[index].mesh) is not None:
+                yield from ((primitive, to_world) for primitive in self._document.meshes[mesh].primitives)
+            waiting += [(child, to_world) for child in reversed(nodes[index].children or [])]
 
     def _bytes_of(self, primitive: pygltflib.Primitive) -> int:
         position = primitive.attributes.POSITION
@@ -139,7 +222,8 @@ class _Reader:
         attributes = primitive.attributes
         if mode not in (_TRIANGLES, _STRIP, _FAN) or attributes.POSITION is None:
             return None
-        if "KHR_draco_mesh_compression" in (primitive.extensions or {}) and not self._has_data(attributes.POSITION):
+        has_data = self._document.accessors[attributes.POSITION].bufferView is not None
+        if "KHR_draco_mesh_compression" in (primitive.extensions or {}) and not has_data:
             raise SceneError(f"{self._path}: uses KHR_draco_mesh_compression, which is not supported")
         local = self._buffers.array(attributes.POSITION).astype(np.float64)
         vertices = local @ to_world[:3, :3].T + to_world[:3, 3]
@@ -149,7 +233,7 @@ class _Reader:
             triangles = triangles[:, ::-1]
         surface = surface_of(None if primitive.material is None else self._document.materials[primitive.material])
         uv = self._coordinates(attributes, surface, len(vertices))
-        textures = [] if uv is None or surface.texture is None else [self._picture(surface.texture)]
+        textures = [] if uv is None or surface.texture is None else [self._picture(self._image(surface.texture))]
         colours = self._colours(attributes, surface, len(vertices))
         mesh = TexturedMesh(
             vertices,
@@ -159,29 +243,30 @@ class _Reader:
             np.full(len(triangles), len(textures) - 1, np.int32),
             textures,
         )
-        return mesh if surface.cutoff is None else self._masked(mesh, colours[:, 3], surface)
+        return mesh if surface.cutoff is None else self._masked(mesh, colours[:, 3], surface.texture, surface.cutoff)
 
-    def _masked(self, mesh: TexturedMesh, alpha: NDArray[np.float32], surface: Surface) -> TexturedMesh:
+    def _masked(self, mesh: TexturedMesh, alpha: NDArray, texture: int | None, cutoff: float) -> TexturedMesh:
         """What alphaMode MASK leaves: factor and vertex alpha decide for triangles, the picture within them."""
-        assert surface.cutoff is not None
         share = alpha[mesh.triangles].mean(axis=1)
-        kept = share >= surface.cutoff
+        kept = share >= cutoff
         mesh = only(mesh, kept)
-        if surface.texture is None or not mesh.textures or not kept.any():
+        if texture is None or not mesh.textures or not kept.any():
             return mesh
-        return with_mask(mesh, self._mask(surface.texture, surface.cutoff / float(share[kept].mean())))
-
-    def _has_data(self, accessor: int) -> bool:
-        return self._document.accessors[accessor].bufferView is not None
+        return with_mask(mesh, self._mask(self._image(texture), cutoff / float(share[kept].mean())))
 
     def _triangles(self, accessor: int | None, mode: int, vertices: int) -> NDArray[np.int32]:
-        if accessor is None:
-            corners = np.arange(vertices, dtype=np.int64)
-        else:
-            corners = self._buffers.array(accessor).reshape(-1).astype(np.int64)
+        """`(t, 3)` vertex indices of a list, strip or fan."""
+        corners = np.arange(vertices) if accessor is None else self._buffers.array(accessor).reshape(-1)
+        corners = corners.astype(np.int64)
         if len(corners) and corners.max() >= vertices:
             raise SceneError(f"{self._path}: a triangle names vertex {corners.max()} of {vertices}")
-        return _corners_to_triangles(corners, mode).astype(np.int32)
+        if mode == _TRIANGLES:
+            return corners[: len(corners) // 3 * 3].reshape(-1, 3).astype(np.int32)
+        first = corners[:-2] if mode == _STRIP else np.broadcast_to(corners[:1], max(len(corners) - 2, 0))
+        triangles = np.stack([first, corners[1:-1], corners[2:]], axis=1).astype(np.int32)
+        if mode == _STRIP:
+            triangles[1::2] = triangles[1::2][:, [1, 0, 2]]
+        return triangles
 
     def _coordinates(self, attributes: Any, surface: Surface, vertices: int) -> NDArray[np.float32] | None:
         accessor = None if surface.texture is None else getattr(attributes, surface.coordinates, None)
@@ -190,24 +275,18 @@ class _Reader:
         uv = self._matching(accessor, surface.coordinates, vertices)[:, :2].astype(np.float32)
         if surface.transform is not None:
             uv = uv @ surface.transform[:, :2].T + surface.transform[:, 2]
-        if self._is_wrapped_otherwise(surface.texture, uv):
-            say_once(str(self._path), "textures that are clamped or mirrored beyond their edges are repeated there")
-        return uv
-
-    def _is_wrapped_otherwise(self, texture: int, uv: NDArray[np.float32]) -> bool:
-        """Whether coordinates leave a picture that its sampler does not repeat there."""
-        sampler = self._document.textures[texture].sampler
-        if sampler is None:
-            return False
-        found: Any = self._document.samplers[sampler]
+        sampler = self._document.textures[surface.texture].sampler
+        found: Any = pygltflib.Sampler() if sampler is None else self._document.samplers[sampler]
         repeated = np.isin([found.wrapS or _REPEAT, found.wrapT or _REPEAT], _REPEAT)
-        return bool((((uv < -_EDGE) | (uv > 1 + _EDGE)) & ~repeated).any())
+        if (((uv < -_EDGE) | (uv > 1 + _EDGE)) & ~repeated).any():
+            warn_once(str(self._path), "textures that are clamped or mirrored beyond their edges are repeated there")
+        return uv
 
     def _colours(self, attributes: Any, surface: Surface, vertices: int) -> NDArray[np.float32]:
         """`(v, 4)` colours and alpha; integers count as fractions even where a file forgets to say so."""
         colours = np.broadcast_to(surface.factor, (vertices, 4)).copy()
         if attributes.COLOR_0 is not None:
-            stored = fractions(self._matching(attributes.COLOR_0, "COLOR_0", vertices))
+            stored = _fractions(self._matching(attributes.COLOR_0, "COLOR_0", vertices))
             first, last = (0 if surface.tinted else 3), stored.shape[1]
             colours[:, first:last] *= stored[:, first:]
         return np.clip(colours, 0, 1).astype(np.float32)
@@ -220,21 +299,6 @@ class _Reader:
             )
         return values
 
-    def _picture(self, texture: int) -> NDArray[np.uint8]:
-        """`(height, width, 3)`; the same object for the same image."""
-        index = self._image(texture)
-        if index not in self._pictures:
-            self._pictures[index] = decode_picture(*self._encoded(index))
-        return self._pictures[index]
-
-    def _mask(self, texture: int, least: float) -> NDArray[np.bool_]:
-        """`(height, width)` where a picture's alpha is at least so much; the same object for the same question."""
-        key = (self._image(texture), least)
-        if key not in self._masks:
-            alpha = decode_picture(*self._encoded(key[0]), "RGBA")[..., 3:]
-            self._masks[key] = (alpha >= 255 * least)[..., 0] if alpha.size else np.ones(alpha.shape[:2], bool)
-        return self._masks[key]
-
     def _image(self, texture: int) -> int:
         entry = self._document.textures[texture]
         index = (entry.extensions or {}).get("EXT_texture_webp", {}).get("source", entry.source)
@@ -243,11 +307,15 @@ class _Reader:
             raise SceneError(f"{self._path}: texture {texture} has {names}; expected a PNG, JPEG or WebP picture")
         return index
 
-    def _encoded(self, index: int) -> tuple[bytes, str]:
-        """An image's bytes, and its name for errors."""
+    def _decode(self, index: int, mode: str = "RGB") -> NDArray[np.uint8]:
         image = self._document.images[index]
         content = self._buffers.resolve(image.uri) if image.uri else bytes(self._buffers.view(image.bufferView))
-        return content, f"{self._path}: image {index}"
+        return decode_picture(content, f"{self._path}: image {index}", mode)
+
+    def _read_mask(self, index: int, least: float) -> NDArray[np.bool_]:
+        """`(height, width)` where a picture's alpha is at least so much."""
+        alpha = self._decode(index, "RGBA")[..., 3:]
+        return (alpha >= 255 * least)[..., 0] if alpha.size else np.ones(alpha.shape[:2], bool)
 
 
 def _parse(content: bytes) -> pygltflib.GLTF2:
@@ -272,35 +340,11 @@ def _local_transform(node: pygltflib.Node) -> NDArray:
         return np.array(node.matrix, np.float64).reshape(4, 4).T
     transform = np.eye(4)
     if node.rotation:
-        transform[:3, :3] = _rotation(np.array(node.rotation, np.float64))
+        from scipy.spatial.transform import Rotation
+
+        transform[:3, :3] = Rotation.from_quat(node.rotation).as_matrix()
     if node.scale:
         transform[:3, :3] *= np.array(node.scale, np.float64)
     if node.translation:
         transform[:3, 3] = node.translation
     return transform
-
-
-def _rotation(quaternion: NDArray) -> NDArray:
-    """`(3, 3)` rotation of a quaternion (x, y, z, w), which need not have unit length."""
-    length = np.linalg.norm(quaternion)
-    if not length > 0:
-        raise ValueError("a node's rotation is the zero quaternion")
-    x, y, z, w = quaternion / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def _corners_to_triangles(corners: NDArray, mode: int) -> NDArray:
-    """`(t, 3)` of `(n,)` vertex indices in a list, strip or fan."""
-    if mode == _TRIANGLES:
-        return corners[: len(corners) // 3 * 3].reshape(-1, 3)
-    first = corners[:-2] if mode == _STRIP else np.broadcast_to(corners[:1], max(len(corners) - 2, 0))
-    triangles = np.stack([first, corners[1:-1], corners[2:]], axis=1)
-    if mode == _STRIP:
-        triangles[1::2] = triangles[1::2][:, [1, 0, 2]]
-    return triangles

@@ -1,19 +1,27 @@
-"""From what the user calls a scene to its mesh in the world."""
+"""From what the user calls a scene to its mesh in the world: read, checked, turned, moved to a local origin."""
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from avp_habitat.errors import SceneError
+from avp_habitat.poses import axes_to_world
 from avp_habitat.scenes.files import SceneFiles
 from avp_habitat.scenes.location import BUILTIN, Frame, SceneLocation, locate
-from avp_habitat.scenes.mesh import TexturedMesh, say_once
-from avp_habitat.scenes.placing import check_numbers, looks_z_up, lost_mm, place
-from avp_habitat.scenes.stage_config import Y_UP
+from avp_habitat.scenes.mesh import TexturedMesh, warn_once
+from avp_habitat.scenes.obj import read_obj
+from avp_habitat.scenes.ply import read_ply
+from avp_habitat.scenes.stage_config import Y_UP, Axes
 
-_GLTF = (".glb", ".gltf")
 _MOST_LOST_MM = 100
+_FAR_M = 1000.0
+"""From here on, float32 has steps of more than 0.06 mm."""
+_LARGEST_M = 1e6
+_LARGEST_ROOM_M = 200
+_MOST_LOOKED_AT = 200_000
 
 
 @dataclass(frozen=True)
@@ -23,7 +31,7 @@ class Scene:
     name: str
     """What the user called it, without folders: a file's name or `builtin:SEED`."""
     digest: str
-    """Hexadecimal SHA-256 of the content; see `scene_digest`."""
+    """Hexadecimal SHA-256 of the content; see `identify`."""
     mesh: TexturedMesh
     """Its surfaces, world frame, metres."""
     frame: Frame = field(default_factory=Frame)
@@ -52,7 +60,7 @@ def load_located(location: SceneLocation, *, origin: Sequence[float] | None = No
     if location.asset is None:
         from avp_habitat.scenes.builtin.room import generate_room
 
-        return Scene(location.name, scene_digest(location), generate_room(_seed(location)))
+        return Scene(location.name, identify(location)[0], generate_room(int(location.name.removeprefix(BUILTIN))))
     if location.objects:
         raise SceneError(
             f"{location.dataset}:{location.scene_id}: has {location.objects} objects besides its stage, which raycast "
@@ -76,10 +84,9 @@ def identify(location: SceneLocation) -> tuple[str, Frame]:
     if location.asset is None:
         from avp_habitat.scenes.builtin.room import GENERATOR_VERSION
 
-        text = f"{BUILTIN}{_seed(location)}:v{GENERATOR_VERSION}"
-        return hashlib.sha256(text.encode()).hexdigest(), Frame()
+        return hashlib.sha256(f"{location.name}:v{GENERATOR_VERSION}".encode()).hexdigest(), Frame()
     files = SceneFiles(location.asset)
-    frame = Frame(up=location.told_up)
+    frame = Frame(up=location.chosen_up)
     try:
         frame = _placed(_read(files), location)[1]
     except SceneError as error:
@@ -87,15 +94,6 @@ def identify(location: SceneLocation) -> tuple[str, Frame]:
         if "KHR_texture_basisu" not in str(error):
             raise
     return _digest(location, files), frame
-
-
-def scene_digest(location: SceneLocation) -> str:
-    """The digest alone of `identify`."""
-    return identify(location)[0]
-
-
-def _seed(location: SceneLocation) -> int:
-    return int(location.name.removeprefix(BUILTIN))
 
 
 def _digest(location: SceneLocation, files: SceneFiles) -> str:
@@ -110,14 +108,15 @@ def _digest(location: SceneLocation, files: SceneFiles) -> str:
 
 def _read(files: SceneFiles) -> TexturedMesh:
     suffix = files.path.suffix.lower()
-    if suffix in _GLTF:
-        from avp_habitat.scenes.gltf import read_gltf as read
-    elif suffix == ".ply":
-        from avp_habitat.scenes.ply import read_ply as read
+    if suffix == ".ply":
+        mesh = read_ply(files)
+    elif suffix == ".obj":
+        mesh = read_obj(files)
     else:
-        from avp_habitat.scenes.obj import read_obj as read
-    mesh = read(files)
-    check_numbers(mesh, files.path)
+        from avp_habitat.scenes.gltf import read_gltf
+
+        mesh = read_gltf(files)
+    _check_numbers(mesh, files.path)
     return mesh
 
 
@@ -126,8 +125,8 @@ def _placed(
 ) -> tuple[TexturedMesh, Frame]:
     """The mesh in the world, and what has to be said of how it lies there."""
     asset = str(location.asset)
-    lost = 0.0 if asset.lower().endswith(".obj") else lost_mm(mesh)
-    mesh, moved = place(mesh, (location.up, location.front), origin, asset)
+    lost = 0.0 if asset.lower().endswith(".obj") else _float32_step_mm(mesh)
+    mesh, moved = _place(mesh, (location.up, location.front), origin, asset)
     if any(moved):
         far = f"{max(map(abs, moved)):.0f} m"
         if lost >= _MOST_LOST_MM:
@@ -136,8 +135,96 @@ def _placed(
                 "expected a mesh that was exported near its origin"
             )
         text = f"lies {far} from its origin: ({', '.join(f'{each:.0f}' for each in moved)}) m are taken off"
-        say_once(asset, text + (f"; as float32, its coordinates are rounded to {lost:.0f} mm" if lost >= 1 else ""))
-    if (location.up, location.front) == Y_UP and location.told_up is None and looks_z_up(mesh):
+        warn_once(asset, text + (f"; as float32, its coordinates are rounded to {lost:.0f} mm" if lost >= 1 else ""))
+    if (location.up, location.front) == Y_UP and location.chosen_up is None and looks_z_up(mesh):
         own = f'"up": [0, 0, 1], "front": [0, 1, 0] in {location.files[-1].name}' if location.files else "--up z"
-        say_once(asset, f"is taken as Y-up, but looks like a Z-up room on its side; if it is one, say {own}")
-    return mesh, Frame(moved, location.told_up)
+        warn_once(asset, f"is taken as Y-up, but looks like a Z-up room on its side; if it is one, say {own}")
+    return mesh, Frame(moved, location.chosen_up)
+
+
+def _check_numbers(mesh: TexturedMesh, path: Path) -> None:
+    """Refuse what a renderer could not use: no triangle, or a number that is NaN or infinite."""
+    if not len(mesh.triangles):
+        raise SceneError(f"{path}: expected a mesh with triangles, found none")
+    for name, values in (("position", mesh.vertices), ("texture coordinate", mesh.uv), ("colour", mesh.colours)):
+        wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if len(wrong):
+            raise SceneError(
+                f"{path}: expected finite numbers, but {len(wrong)} of {len(values)} vertices have a {name} that "
+                f"is NaN or infinite (the first is vertex {wrong[0]})"
+            )
+
+
+def _float32_step_mm(mesh: TexturedMesh) -> float:
+    """Step in millimetres of the greatest coordinate, when the file's numbers are no finer than float32; else 0."""
+    largest = np.abs(mesh.vertices).max()
+    if not largest < np.finfo(np.float32).max or (mesh.vertices.astype(np.float32) != mesh.vertices).any():
+        return 0.0
+    return 1000 * float(np.spacing(np.float32(largest)))
+
+
+def _place(
+    mesh: TexturedMesh, axes: Axes, origin: Sequence[float] | None, name: str
+) -> tuple[TexturedMesh, tuple[float, float, float]]:
+    """Turn a mesh to the world's axes and take a local origin off, in float64, before it is cut to float32.
+
+    Without an origin, whole metres are taken off along each axis on which all triangles are farther than a kilometre
+    from zero (georeferenced scenes: UTM, ECEF), so that the middle comes to zero.
+    """
+    vertices = mesh.vertices.astype(np.float64)
+    if axes != Y_UP:
+        # Written out, because BLAS may add in another order on other machines.
+        x, y, z = vertices.T
+        vertices = np.stack([row[0] * x + row[1] * y + row[2] * z for row in axes_to_world(*axes)], axis=1)
+    used = np.zeros(len(vertices), bool)
+    used[mesh.triangles] = True
+    low, high = vertices[used].min(axis=0), vertices[used].max(axis=0)
+    if origin is None:
+        far = (low > _FAR_M) | (high < -_FAR_M)
+        origin = np.where(far, np.round(low / 2 + high / 2), 0.0).tolist()
+    shift = np.asarray(origin, np.float64)
+    largest = np.abs(np.stack([low - shift, high - shift])).max()
+    if largest > _LARGEST_M:
+        raise SceneError(
+            f"{name}: has coordinates of {largest:.3g} m, where float32 cannot hold millimetres: expected a room in "
+            "metres, at most 1000 km wide"
+        )
+    # What no triangle uses may lie anywhere.
+    moved = np.clip(vertices - shift, -_LARGEST_M, _LARGEST_M).astype(np.float32)
+    return replace(mesh, vertices=moved), (float(shift[0]), float(shift[1]), float(shift[2]))
+
+
+def looks_z_up(mesh: TexturedMesh) -> bool:
+    """Whether a mesh that is taken as Y-up looks like a room with Z up that lies on its side.
+
+    All of these hold: along Z it is as high as a storey, and along Y clearly larger than that and than a storey; the
+    two largest level planes (floor and ceiling, which nothing breaks up as windows and doors do walls) are those
+    across Z; what is not a large plane, the furniture, keeps to the lower end of Z, and more so than to that of Y; and
+    what is level across Y is not spread evenly as the steps of a stairwell are. The shares are those that part 31
+    generated rooms, two scanned ones and a box room, laid on their sides, from 500 corridors, stairwells, attics and
+    lofts that stand upright.
+    """
+    triangles = mesh.triangles[:: max(1, len(mesh.triangles) // _MOST_LOOKED_AT)]
+    corners = mesh.vertices[triangles].astype(np.float64)
+    crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.sqrt((crossed * crossed).sum(axis=1)) / 2
+    level = np.abs(crossed) > 0.98 * 2 * area[:, None]
+    middle = corners.mean(axis=1)
+    middle -= middle.min(axis=0)
+    extent = middle.max(axis=0)
+    if not (1.9 <= extent[2] <= 5.0 and max(3.3, 1.15 * extent[2]) < extent[1] < _LARGEST_ROOM_M):
+        return False
+    planes, small = np.zeros(3), np.ones(len(area), bool)
+    for axis in range(3):
+        bins = np.minimum(middle[:, axis] / 0.1, 10 * _LARGEST_ROOM_M).astype(np.int64)
+        in_bin = np.bincount(bins, weights=area * level[:, axis])
+        planes[axis] = np.sort(in_bin)[-2:].sum()
+        small &= ~(level[:, axis] & (in_bin[bins] > 0.02 * area.sum()))
+    lower = [(area * (small & (middle[:, k] < 0.4 * extent[k]))).sum() / max(area[small].sum(), 1e-9) for k in (1, 2)]
+    share = np.bincount((16 * middle[:, 1] / extent[1]).astype(np.int64), weights=area * level[:, 1])[1:15]
+    return bool(
+        planes[2] > 1.2 * max(planes[0], planes[1])
+        and lower[1] > max(0.55, lower[0])
+        and lower[0] < 0.75
+        and share.std() > 0.4 * share.mean()
+    )

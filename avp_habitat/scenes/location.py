@@ -2,13 +2,24 @@
 
 import difflib
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from avp_habitat.errors import AVPError, SceneError, UsageError
-from avp_habitat.scenes import replica
+from avp_habitat.scenes.dataset import SceneDataset
 from avp_habitat.scenes.files import SUFFIXES, broken_link
-from avp_habitat.scenes.stage_config import STAGE_CONFIG, Y_UP, Z_UP, Layer, Vector, read_config, read_stage
+from avp_habitat.scenes.stage_config import (
+    REPLICA_MESH,
+    STAGE_CONFIG,
+    Y_UP,
+    Z_UP,
+    Layer,
+    SceneLocation,
+    is_replica_scene,
+    read_config,
+    read_stage,
+    replica_scene,
+)
 
 BUILTIN = "builtin:"
 UPS = ("y", "z")
@@ -33,30 +44,6 @@ class Frame:
     """The axis of the file that was said to point up; None where nobody said."""
 
 
-@dataclass(frozen=True)
-class SceneLocation:
-    """Where a scene is."""
-
-    name: str
-    """As rollouts call it, without folders: a file's name, `room_0`, or `builtin:SEED`."""
-    asset: Path | None
-    """The mesh file that is shown; None for a generated room."""
-    up: Vector = Y_UP[0]
-    """Unit vector in the asset's coordinates that points up."""
-    front: Vector = Y_UP[1]
-    """Unit vector in the asset's coordinates, at right angles to `up`, that becomes the world's -Z."""
-    told_up: str | None = None
-    """The axis that the user said points up, None for what the file or its config says."""
-    dataset: Path | None = None
-    """The scene dataset config that the scene belongs to, None for one that was named without it."""
-    scene_id: str | None = None
-    """The scene's id there: the handle that the user's id stands for, which no other scene has."""
-    objects: int = 0
-    """Objects, articulated ones included, that the scene has beyond its stage."""
-    files: tuple[Path, ...] = field(default=())
-    """The configs that were read: of the dataset, of the scene, of the stage."""
-
-
 def locate(spec: str | Path, *, up: str | None = None) -> SceneLocation:
     """Find a scene without reading its mesh.
 
@@ -79,7 +66,8 @@ def locate(spec: str | Path, *, up: str | None = None) -> SceneLocation:
     if up is not None and path.name.endswith((DATASET_CONFIG, STAGE_CONFIG)):
         raise UsageError(f"up: {path} says itself which axis of its mesh points up; expected none beside it, got {up}")
     if path.name.endswith(DATASET_CONFIG):
-        return _in_dataset(path, scene_id)
+        _expect_file(path, (DATASET_CONFIG,))
+        return SceneDataset(path).scene(scene_id)
     if path.name.endswith(STAGE_CONFIG):
         return _stage(path)
     if path.is_dir():
@@ -87,11 +75,12 @@ def locate(spec: str | Path, *, up: str | None = None) -> SceneLocation:
     elif path.suffix.lower() not in SUFFIXES:
         raise _unknown(path)
     _expect_file(path, SUFFIXES)
-    found = _mesh(path)
+    scene = replica_scene(path)
+    found = SceneLocation(path.name, path) if scene is None else SceneLocation(scene.name, path, *Z_UP)
     if up is None:
         return found
     axes = {"y": Y_UP, "z": Z_UP}[up]
-    return replace(found, up=axes[0], front=axes[1], told_up=up)
+    return replace(found, up=axes[0], front=axes[1], chosen_up=up)
 
 
 def _seed(spec: str) -> int:
@@ -101,53 +90,31 @@ def _seed(spec: str) -> int:
     return int(text)
 
 
-def _mesh(path: Path) -> SceneLocation:
-    scene = replica.scene_folder(path)
-    return SceneLocation(path.name, path) if scene is None else SceneLocation(scene.name, path, *Z_UP)
+def _replica_scenes(folder: Path) -> list[str]:
+    """Names of the scenes in a folder that holds Replica, sorted."""
+    return sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and is_replica_scene(entry))
 
 
 def _mesh_of(folder: Path) -> Path:
     """The mesh that is shown of a scene folder of Replica."""
-    if replica.is_scene(Path(os.path.abspath(folder))):
-        return folder / replica.MESH
-    scenes = replica.scenes_within(folder)
+    if is_replica_scene(Path(os.path.abspath(folder))):
+        return folder / REPLICA_MESH
+    scenes = _replica_scenes(folder)
     hint = f"; name one of its {len(scenes)} scenes, {folder / scenes[0]} say" if scenes else ""
     raise SceneError(f"{folder}: expected a scene file, found a folder that is no scene of Replica{hint}")
 
 
 def _stage(path: Path) -> SceneLocation:
     _expect_file(path, (STAGE_CONFIG,))
-    scene = replica.scene_folder(path)
-    name = path.name.removesuffix(STAGE_CONFIG)
+    scene, name = replica_scene(path), path.name.removesuffix(STAGE_CONFIG)
     # Replica's stage config lies in habitat/ and shows ../mesh.ply, so the folder above is part of the data.
-    stage = read_stage(
-        [Layer(read_config(path), path)],
-        path.parent,
-        Path(os.path.abspath(path)).parents[1],
-        name=name,
-        axes=Y_UP if scene is None else Z_UP,
-    )
-    return SceneLocation(name if scene is None else scene.name, stage.asset, *stage.axes, files=(path,))
-
-
-def _in_dataset(path: Path, scene_id: str) -> SceneLocation:
-    from avp_habitat.scenes.dataset import SceneDataset
-
-    _expect_file(path, (DATASET_CONFIG,))
-    found = SceneDataset(path).scene(scene_id)
-    return SceneLocation(
-        found.name,
-        found.stage.asset,
-        *found.stage.axes,
-        dataset=path,
-        scene_id=found.handle,
-        objects=found.objects,
-        files=(path, *found.files),
-    )
+    root, axes = Path(os.path.abspath(path)).parents[1], Y_UP if scene is None else Z_UP
+    asset, axes = read_stage([Layer(read_config(path), path)], path.parent, root, name=name, axes=axes)
+    return SceneLocation(name if scene is None else scene.name, asset, *axes, files=(path,))
 
 
 def _unknown(path: Path) -> AVPError:
-    folders = replica.scenes_within(path.parent) if path.parent.is_dir() else []
+    folders = _replica_scenes(path.parent) if path.parent.is_dir() else []
     near = difflib.get_close_matches(path.name, folders, n=2, cutoff=0.5)
     if near:
         return SceneError(f"{path}: no such folder; did you mean {' or '.join(near)}?")

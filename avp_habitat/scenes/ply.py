@@ -7,15 +7,14 @@ a number of values of its own in each row (G. Turk, The PLY Polygon File Format)
 import re
 import struct
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles, decode_picture
-from avp_habitat.scenes.mesh import TexturedMesh, say_once
-from avp_habitat.scenes.polygons import triangulate
+from avp_habitat.scenes.mesh import TexturedMesh, triangulate, warn_once
 
 _CODES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _CODES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
@@ -31,29 +30,27 @@ _MALFORMED = (ArithmeticError, LookupError, TypeError, ValueError, struct.error)
 
 @dataclass(frozen=True)
 class _Property:
+    """How values lie in the body, where a text's numbers are float64; a single value has no type of a count."""
+
     name: str
     values: np.dtype
-    """As they lie in the body; every number of a text is a float64 there."""
     count: np.dtype | None
-    """Of a list's number of values; None for a single value."""
     integer: bool
-    """Whether the header says that the values are whole numbers."""
 
 
 @dataclass(frozen=True)
 class _Element:
     name: str
     rows: int
-    properties: list[_Property] = field(default_factory=list)
+    properties: list[_Property]
 
 
 @dataclass(frozen=True)
 class _Column:
-    """The values of a property, row after row."""
+    """The values of a property, row after row, and `(rows,)` how many of them each row has."""
 
     values: NDArray
     lengths: NDArray[np.int64]
-    """`(rows,)` how many values each row has."""
     integer: bool
 
 
@@ -80,75 +77,45 @@ def read_ply(files: SceneFiles) -> TexturedMesh:
 
 
 def _tables(content: bytes) -> tuple[dict[str, _Columns], list[str]]:
-    """The columns of each element, and the names of the textures.
-
-    Raises:
-        ValueError: the header or the body cannot be right.
-    """
+    """The columns of each element, and the names of the textures."""
     end = re.search(rb"\bend_header[ \t]*(\r\n|\n|\r|$)", content)
     if not content.startswith(b"ply"):
         raise ValueError("it does not begin with the line ply")
     if end is None:
         raise ValueError("truncated: expected a header that ends with end_header")
     lines = content[: end.start()].decode("utf-8", "replace").splitlines()
-    order, elements, pictures = _header([line.split() for line in lines[1:] if line.strip()], lines)
-    body = text = content[end.end() :]
-    if order == "=":
-        body = _numbers(text)
+    order, elements = _header([line.split() for line in lines[1:] if line.strip()])
+    body = content[end.end() :]
+    numbers = _numbers(body) if order == "=" else body
     at, tables = 0, {}
     for element in elements:
-        tables[element.name], at = _read(element, body, at)
+        tables[element.name], at = _read(element, numbers, at)
     if order == "=":
-        _check_lines(elements, tables, text)
-    return tables, pictures
+        _check_lines(elements, tables, body)
+    return tables, [
+        found[1].strip() for line in lines if (found := re.match(r"(?i)comment\s+TextureFile\s+(.+)", line))
+    ]
 
 
-def _check_lines(elements: list[_Element], tables: dict[str, _Columns], text: bytes) -> None:
-    """Refuse a text in which a row lacks a number, or has one too many, that others then stood for.
-
-    Raises:
-        ValueError: there are as many lines as rows, and one holds not what its row needs.
-    """
-    rows = [np.zeros(0, np.int64)]
-    for each in elements:
-        if columns := tables[each.name]:
-            rows.append(
-                np.sum([columns[one.name].lengths + (one.count is not None) for one in each.properties], axis=0)
-            )
-    expected = np.concatenate(rows)
-    characters = np.frombuffer(text, np.uint8)
-    begin = np.flatnonzero((characters > 32) & (np.append(32, characters[:-1]) <= 32))
-    line = np.searchsorted(np.flatnonzero((characters == 10) | (characters == 13)), begin)
-    found = np.diff(np.flatnonzero(np.diff(line, prepend=-1, append=-1)))
-    # Lines may be broken anywhere by who does not care for them.
-    if len(found) == len(expected) and (found != expected).any():
-        row = np.flatnonzero(found != expected)[0]
-        raise ValueError(f"line {row + 1} after the header has {found[row]} numbers; expected {expected[row]}")
-
-
-def _header(words: list[list[str]], lines: list[str]) -> tuple[str, list[_Element], list[str]]:
+def _header(lines: list[list[str]]) -> tuple[str, list[_Element]]:
     order, elements = "", []
-    for line in words:
-        if line[0] == "format":
-            order = _ORDERS[line[1]]
-        elif line[0] == "element":
-            elements.append(_Element(line[1], int(line[2])))
+    for words in lines:
+        if words[0] == "format":
+            order = _ORDERS[words[1]]
+        elif words[0] == "element":
+            elements.append(_Element(words[1], int(words[2]), []))
             if elements[-1].rows < 0:
-                raise ValueError(f"element {line[1]} has {line[2]} rows")
-        elif line[0] == "property":
-            elements[-1].properties.append(_property(line[1:], order))
-    pictures = [found[1].strip() for line in lines if (found := re.match(r"(?i)comment\s+TextureFile\s+(.+)", line))]
+                raise ValueError(f"element {words[1]} has {words[2]} rows")
+        elif words[0] == "property":
+            codes = [_CODES.get(word) for word in (words[2:4] if words[1] == "list" else words[1:2])]
+            if None in codes or not order:
+                raise ValueError(f"expected a property of a known type, got {' '.join(words[1:])}")
+            *count, values = (np.dtype("=f8" if order == "=" else f"{order}{code}") for code in codes)
+            integer = str(codes[-1])[0] in "iu"
+            elements[-1].properties.append(_Property(words[-1], values, count[0] if count else None, integer))
     if not order:
         raise ValueError("the header names no format")
-    return order, elements, pictures
-
-
-def _property(words: list[str], order: str) -> _Property:
-    codes = [_CODES.get(word) for word in (words[1:3] if words[0] == "list" else words[:1])]
-    if None in codes or not order:
-        raise ValueError(f"expected a property of a known type, got {' '.join(words)}")
-    stored = [np.dtype("=f8" if order == "=" else f"{order}{code}") for code in codes]
-    return _Property(words[-1], stored[-1], stored[0] if len(stored) == 2 else None, str(codes[-1])[0] in "iu")
+    return order, elements
 
 
 def _numbers(text: bytes) -> bytes:
@@ -162,68 +129,79 @@ def _numbers(text: bytes) -> bytes:
             raise ValueError("expected numbers after the header, got something else") from None
 
 
+def _check_lines(elements: list[_Element], tables: dict[str, _Columns], text: bytes) -> None:
+    """Refuse a text of as many lines as rows in which a row lacks a number, or has one too many."""
+    rows = [np.zeros(0, np.int64)]
+    for each in elements:
+        if columns := tables[each.name]:
+            of_row = [columns[one.name].lengths + (one.count is not None) for one in each.properties]
+            rows.append(np.sum(of_row, axis=0))
+    expected = np.concatenate(rows)
+    characters = np.frombuffer(text, np.uint8)
+    begin = np.flatnonzero((characters > 32) & (np.append(32, characters[:-1]) <= 32))
+    line = np.searchsorted(np.flatnonzero((characters == 10) | (characters == 13)), begin)
+    found = np.diff(np.flatnonzero(np.diff(line, prepend=-1, append=-1)))
+    if len(found) == len(expected) and (found != expected).any():
+        row = np.flatnonzero(found != expected)[0]
+        raise ValueError(f"line {row + 1} after the header has {found[row]} numbers; expected {expected[row]}")
+
+
 def _read(element: _Element, body: bytes, start: int) -> tuple[_Columns, int]:
     """The columns of an element whose rows start at a byte of the body, and where they end."""
-    least = sum((each.count or each.values).itemsize for each in element.properties)
-    if element.rows * least > len(body) - start:
+    properties, rows = element.properties, element.rows
+    least = sum((each.count or each.values).itemsize for each in properties)
+    if rows * least > len(body) - start:
         raise ValueError(
-            f"truncated: the header announces {element.rows} rows of {element.name}, for which {len(body) - start} "
-            f"bytes are left where at least {element.rows * least} are needed"
+            f"truncated: the header announces {rows} rows of {element.name}, for which {len(body) - start} bytes are "
+            f"left where at least {rows * least} are needed"
         )
-    if not element.rows or not element.properties:
+    if not rows or not properties:
         return {}, start
     places, end = _walk(element, body, start, 1)
-    row = end - start
-    if start + row * element.rows <= len(body) and _all_alike(element, body, places[0], row):
-        shapes = [(element.rows, int(length)) for _, length in places[0]]
-        columns = [
-            np.ndarray(shape, each.values, body, int(at), (row, each.values.itemsize)).reshape(-1)
-            for each, shape, (at, _) in zip(element.properties, shapes, places[0], strict=True)
-        ]
-        lengths = [np.full(rows, length) for rows, length in shapes]
-        end = start + row * element.rows
+    table = _table(element, body, start, places[0, :, 1].tolist())
+    if table is not None:
+        end = start + table.nbytes
+        columns = [(table[f"values {k}"].reshape(-1), np.full(rows, places[0, k, 1])) for k in range(len(properties))]
     else:
-        places, end = _walk(element, body, start, element.rows)
-        lengths = list(places[:, :, 1].T)
-        columns = [
-            np.frombuffer(b"".join([body[at : at + n * each.values.itemsize] for at, n in place]), each.values)
-            for each, place in zip(element.properties, places.transpose(1, 0, 2).tolist(), strict=True)
-        ]
-    return {
-        each.name: _Column(values, length, each.integer)
-        for each, values, length in zip(element.properties, columns, lengths, strict=True)
-    }, end
+        places, end = _walk(element, body, start, rows)
+        columns = []
+        for each, own in zip(properties, places.transpose(1, 0, 2), strict=True):
+            parts = [body[at : at + count * each.values.itemsize] for at, count in own.tolist()]
+            columns.append((np.frombuffer(b"".join(parts), each.values), own[:, 1]))
+    found = zip(properties, columns, strict=True)
+    return {each.name: _Column(values, lengths, each.integer) for each, (values, lengths) in found}, end
+
+
+def _table(element: _Element, body: bytes, start: int, lengths: list[int]) -> NDArray[np.void] | None:
+    """All rows at once where the lists of each are as long as those of the first one; None where they are not."""
+    fields = []
+    for number, (each, length) in enumerate(zip(element.properties, lengths, strict=True)):
+        fields += [] if each.count is None else [(f"count {number}", each.count)]
+        fields.append((f"values {number}", each.values, (length,)))
+    row = np.dtype(fields)
+    if row.itemsize * element.rows > len(body) - start:
+        return None
+    table = np.frombuffer(body, row, element.rows, start)
+    counts = [name for name in row.fields or () if name.startswith("count")]
+    alike = all((table[name] == lengths[int(name.split()[1])]).all() for name in counts)
+    return table if alike else None
 
 
 def _walk(element: _Element, body: bytes, at: int, rows: int) -> tuple[NDArray[np.int64], int]:
     """`(rows, properties, 2)` first byte and number of values of each property, and where the last row ends."""
     places = []
-    counts = [None if each.count is None else struct.Struct(_struct_code(each.count)) for each in element.properties]
-    sizes = [each.values.itemsize for each in element.properties]
+    stored = [(each.count, each.values.itemsize) for each in element.properties]
+    steps = [(n and struct.Struct(n.byteorder.replace("|", "=") + n.char), size) for n, size in stored]
     for _ in range(rows):
-        for count, size in zip(counts, sizes, strict=True):
+        for count, size in steps:
             length = 1
-            if count is not None and at + count.size <= len(body):
+            if count and at + count.size <= len(body):
                 length, at = int(count.unpack_from(body, at)[0]), at + count.size
             places.append((at, length))
             at += length * size
             if length < 0 or at > len(body):
                 raise ValueError(f"truncated: the rows of {element.name} do not end where the file does")
-    return np.array(places, np.int64).reshape(rows, len(sizes), 2), at
-
-
-def _struct_code(stored: np.dtype) -> str:
-    return (">" if stored.byteorder == ">" else "<") + stored.char
-
-
-def _all_alike(element: _Element, body: bytes, places: NDArray[np.int64], row: int) -> bool:
-    """Whether the lists of all rows are as long as those of the first one."""
-    for each, (at, length) in zip(element.properties, places.tolist(), strict=True):
-        if each.count is not None:
-            counts = np.ndarray((element.rows,), each.count, body, at - each.count.itemsize, (row,))
-            if (counts != length).any():
-                return False
-    return True
+    return np.array(places, np.int64).reshape(rows, len(steps), 2), at
 
 
 def _mesh(files: SceneFiles, tables: dict[str, _Columns], pictures: list[str]) -> TexturedMesh:
@@ -240,28 +218,29 @@ def _mesh(files: SceneFiles, tables: dict[str, _Columns], pictures: list[str]) -
         raise SceneError(f"{files.path}: a face names vertices {named.min()} to {named.max()} of {len(positions)}")
     corners, faces = triangulate(listed.lengths, named, positions)
     triangles = named[corners]
-    colours, of_faces = _colours(vertex), _colours(face)
-    wedges = _wedges(face, listed, corners)
-    if (colours is None and of_faces is not None) or wedges is not None:
+    colours, of_faces, uv = _colours(vertex), _colours(face), _wedges(face, listed, corners)
+    if (colours is None and of_faces is not None) or uv is not None:
         # Colours and texture coordinates of faces: each triangle gets corners of its own.
-        colours = colours[triangles].reshape(-1, 3) if colours is not None else None
-        if colours is None and of_faces is not None:
+        if colours is not None:
+            colours = colours[triangles].reshape(-1, 3)
+        elif of_faces is not None:
             colours = np.repeat(of_faces[faces], 3, axis=0)
-        uv = wedges
         positions = positions[triangles].reshape(-1, 3)
         triangles = np.arange(len(positions)).reshape(-1, 3)
     else:
         uv = next((found for names in _COORDINATES if (found := _together(vertex, names)) is not None), None)
     textures = [decode_picture(files.read(name), f"{files.path}: {name}") for name in pictures]
     if colours is None and not (textures and uv is not None):
-        _say_what_is_lost(files, vertex, face, pictures)
+        _warn_of_unread_colours(files, [*vertex, *face], pictures)
+    if uv is None:
+        textures = []
     return TexturedMesh(
         positions,
         triangles.astype(np.int32),
-        _downwards(uv, len(positions)),
+        np.zeros((len(positions), 2), np.float32) if uv is None else (uv * [1, -1] + [0, 1]).astype(np.float32),
         np.ones((len(positions), 3), np.float32) if colours is None else colours,
-        _texture_index(face, faces, len(textures) if uv is not None else 0),
-        textures if uv is not None else [],
+        _texture_index(face, faces, len(textures)),
+        textures,
     )
 
 
@@ -292,12 +271,6 @@ def _wedges(face: _Columns, listed: _Column, corners: NDArray[np.int64]) -> NDAr
     return found.values.astype(np.float64).reshape(-1, 2)[corners].reshape(-1, 2)
 
 
-def _downwards(uv: NDArray[np.float64] | None, count: int) -> NDArray[np.float32]:
-    if uv is None:
-        return np.zeros((count, 2), np.float32)
-    return np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype(np.float32)
-
-
 def _texture_index(face: _Columns, faces: NDArray[np.int64], textures: int) -> NDArray[np.int32]:
     """`(t,)` the texture that a face names, which is the first one where it names none."""
     if not textures or "texnumber" not in face:
@@ -306,10 +279,10 @@ def _texture_index(face: _Columns, faces: NDArray[np.int64], textures: int) -> N
     return np.where((named >= 0) & (named < textures), named, -1).astype(np.int32)
 
 
-def _say_what_is_lost(files: SceneFiles, vertex: _Columns, face: _Columns, pictures: list[str]) -> None:
-    names = [name for name in (*vertex, *face) if _COLOUR_LIKE.search(name)]
-    known = "colours are read from " + ", ".join("/".join(each) for each in _COLOURS)
+def _warn_of_unread_colours(files: SceneFiles, properties: list[str], pictures: list[str]) -> None:
+    names = [name for name in properties if _COLOUR_LIKE.search(name)]
     if names:
-        say_once(str(files.path), f"is shown white: its {', '.join(names)} are not followed ({known})")
+        known = "colours are read from " + ", ".join("/".join(each) for each in _COLOURS)
+        warn_once(str(files.path), f"is shown white: its {', '.join(names)} are not followed ({known})")
     elif pictures:
-        say_once(str(files.path), f"is shown white: it names {', '.join(pictures)}, but has no texture coordinates")
+        warn_once(str(files.path), f"is shown white: it names {', '.join(pictures)}, but has no texture coordinates")

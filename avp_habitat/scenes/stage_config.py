@@ -1,7 +1,17 @@
-"""Habitat-Sim's stage configs: the mesh that a stage shows, and the axes of that mesh.
+"""Habitat-Sim's stage configs and Replica's folders: the mesh that is shown, and the axes of that mesh.
 
 What a config means is followed, for every kind of mesh. Version 0.3.4 itself turns a `.glb` so, but shows a `.ply` or
 `.obj` as it lies, whatever its axes, and without vertex colours (ResourceManager::loadRenderAssetGeneral).
+
+A scene of Replica lies on disk like this (github.com/facebookresearch/Replica-Dataset, README.md):
+
+    replica.scene_dataset_config.json           room_0/habitat/mesh_semantic.ply    quads with an object_id per face
+    room_0/mesh.ply   quads, vertex colours     room_0/habitat/info_semantic.json
+    room_0/textures/  (PTex, not shown here)    room_0/habitat/replica_stage.stage_config.json
+
+Both meshes are Z-up (github.com/facebookresearch/habitat-sim, issue 2631). The stage config says nothing of that: its
+keys are render_asset (`../mesh.ply`), semantic_asset, semantic_descriptor_filename and nav_asset (as quoted in
+github.com/facebookresearch/sound-spaces, issue 143); the axes stand in the dataset config's defaults for stages.
 """
 
 import json
@@ -10,12 +20,13 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SUFFIXES, broken_link
 
 STAGE_CONFIG = ".stage_config.json"
+Value = TypeVar("Value")
 Vector = tuple[float, float, float]
 Axes = tuple[Vector, Vector]
 Y_UP: Axes = ((0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
@@ -26,6 +37,9 @@ render asset is a `.glb` too: only an asset without any config is taken for Z-up
 """
 Z_UP: Axes = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
 """Up and front of Replica, Matterport3D and HM3D."""
+REPLICA_MESH = "mesh.ply"
+_REPLICA_FILES = ("mesh_semantic.ply", "info_semantic.json", "replica_stage.stage_config.json")
+_HABITAT = "habitat"
 _FILE_NAME_TAG = "%%CONFIG_NAME_AS_ASSET_FILENAME%%"
 _NEUTRAL = {"origin": [0, 0, 0], "scale": [1, 1, 1], "units_to_meters": 1}
 
@@ -43,21 +57,51 @@ class Layer:
 
 
 @dataclass(frozen=True)
-class Stage:
-    """What a stage shows."""
+class SceneLocation:
+    """Where a scene is."""
 
-    asset: Path
-    """The mesh file; it exists."""
-    axes: Axes
-    """Unit vectors up and front in the asset's coordinates, at right angles."""
+    name: str
+    """As rollouts call it, without folders: a file's name, `room_0`, or `builtin:SEED`."""
+    asset: Path | None
+    """The mesh file that is shown; None for a generated room."""
+    up: Vector = Y_UP[0]
+    """Unit vector in the asset's coordinates that points up."""
+    front: Vector = Y_UP[1]
+    """Unit vector in the asset's coordinates, at right angles to `up`, that becomes the world's -Z."""
+    chosen_up: str | None = None
+    """The axis that the user said points up, None for what the file or its config says."""
+    dataset: Path | None = None
+    """The scene dataset config that the scene belongs to, None for one that was named without it."""
+    scene_id: str | None = None
+    """The scene's id there: the handle that the user's id stands for, which no other scene has."""
+    objects: int = 0
+    """Objects, articulated ones included, that the scene has beyond its stage."""
+    files: tuple[Path, ...] = ()
+    """The configs that were read: of the dataset, of the scene, of the stage."""
+
+
+def replica_scene(path: Path) -> Path | None:
+    """The folder of the scene that a mesh or stage config of Replica belongs to, None for any other file.
+
+    Args:
+        path: `room_0/mesh.ply`, `room_0/habitat/mesh_semantic.ply` or the stage config beside it.
+    """
+    folder = Path(os.path.abspath(path)).parent
+    if path.name in (_REPLICA_FILES[0], _REPLICA_FILES[2]) and folder.name == _HABITAT:
+        folder = folder.parent
+    elif path.name != REPLICA_MESH:
+        return None
+    return folder if is_replica_scene(folder) else None
+
+
+def is_replica_scene(folder: Path) -> bool:
+    """Whether a folder has `habitat/` with at least two of Replica's files in it, or one of them and `mesh.ply`."""
+    count = sum((folder / _HABITAT / name).is_file() for name in _REPLICA_FILES)
+    return count > 0 and count + (folder / REPLICA_MESH).is_file() > 1
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """The object that a JSON file holds.
-
-    Raises:
-        SceneError: the file cannot be read, or holds something else.
-    """
+    """The object that a JSON file holds; SceneError where it cannot be read, or holds something else."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -69,8 +113,17 @@ def read_config(path: Path) -> dict[str, Any]:
     return content
 
 
-def read_stage(layers: Sequence[Layer], folder: Path, root: Path, *, name: str, axes: Axes = Y_UP) -> Stage:
-    """The stage that attributes describe.
+def member(cell: Any, key: str, default: Value, where: str) -> Value:
+    """The object, list or text under a key of a JSON object, or the default; SceneError where it is something else."""
+    value = cell.get(key, default) if isinstance(cell, dict) else cell
+    if not isinstance(value, type(default)):
+        kind = {dict: "an object", list: "a list", str: "a text"}[type(default)]
+        raise SceneError(f"{where}{key}: expected {kind}, got {shown(value)}")
+    return value
+
+
+def read_stage(layers: Sequence[Layer], folder: Path, root: Path, *, name: str, axes: Axes = Y_UP) -> tuple[Path, Axes]:
+    """The mesh file that a stage of some attributes shows, and its up and front.
 
     Args:
         layers: the attributes; the last layer is the stage's own.
@@ -90,7 +143,7 @@ def read_stage(layers: Sequence[Layer], folder: Path, root: Path, *, name: str, 
         # Habitat-Sim takes a mesh of such a name for one with semantic labels, and after it has applied the config's
         # axes, it turns the mesh from Z-up to Y-up (ResourceManager and GenericSemanticMeshData in its sources).
         up, front = (0.0 - front[0], 0.0 - front[1], 0.0 - front[2]), up
-    return Stage(asset, (up, front))
+    return asset, (up, front)
 
 
 def find(layers: Sequence[Layer], key: str) -> tuple[Any, Layer]:
@@ -100,18 +153,10 @@ def find(layers: Sequence[Layer], key: str) -> tuple[Any, Layer]:
 
 
 def expect_neutral(layers: Sequence[Layer], key: str, *neutral: Any) -> None:
-    """Refuse an attribute that moves, turns or scales a stage.
+    """Refuse, by a SceneError, an attribute that moves, turns or scales a stage: all but the `neutral` values.
 
     Habitat-Sim 0.3.4 reads origin, units_to_meters and the stage's place in a scene instance without using them, and
     scales what is seen but not the NavMesh; older versions do not scale. No two simulators would show the same scene.
-
-    Args:
-        layers: the attributes.
-        key: of the one attribute.
-        neutral: values that change nothing.
-
-    Raises:
-        SceneError: the attribute is there and is not neutral.
     """
     value, layer = find(layers, key)
     if value is None or value in neutral:
@@ -122,17 +167,14 @@ def expect_neutral(layers: Sequence[Layer], key: str, *neutral: Any) -> None:
     )
 
 
-def inside(target: Path, root: Path, told_by: str, value: str) -> Path:
-    """The same path without `..`, when it does not leave the data set.
+def inside(target: Path, root: Path, where: str, value: str) -> Path:
+    """The same path without `..`; SceneError where it leaves the data set's folder.
 
-    Absolute paths are judged by the same rule. What counts is the path as it is written: links may lead anywhere.
-
-    Raises:
-        SceneError: it lies outside of `root`.
+    What counts is the path as it is written: links may lead anywhere.
     """
     # No file system takes the null character, and asking about one is an error of its own.
     if "\0" in value or not Path(os.path.abspath(target)).is_relative_to(os.path.abspath(root)):
-        raise SceneError(f"{told_by}: {value!r} lies outside of {root}, the folder of its data")
+        raise SceneError(f"{where}: {value!r} lies outside of {root}, the folder of its data")
     return Path(os.path.normpath(target))
 
 

@@ -1,4 +1,4 @@
-"""What the task asks of a simulator, and nothing more."""
+"""What the task asks of a simulator, and nothing more; what only some can do has a Protocol of its own."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from avp_habitat.errors import SimulatorError
 from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.poses import Intrinsics
 from avp_habitat.scenes.location import Frame
@@ -25,7 +26,7 @@ class Simulator(Protocol):
     """A scene in which agents stand, walk and look."""
 
     name: str
-    """`"raycast"` or `"habitat"`."""
+    """As rollouts store it: `"raycast"`, for example."""
     version: str
     """Version of the engine that renders."""
     scene: str
@@ -41,7 +42,7 @@ class Simulator(Protocol):
         ...
 
     def render(self, camera_to_world: NDArray[np.floating], intrinsics: Intrinsics, *, rgb: bool) -> Frames:
-        """Depth, and colour when asked for, of `(n, 4, 4)` habitat poses."""
+        """Depth, and colour when asked for (None where a simulator has none), of `(n, 4, 4)` habitat poses."""
         ...
 
     def visible(
@@ -53,7 +54,7 @@ class Simulator(Protocol):
         *,
         tolerance_m: float,
     ) -> NDArray[np.bool_]:
-        """Whether cameras see points: inside the image (`poses.in_image`), and reached by the ray through it.
+        """Whether cameras see points: inside the image (`sight.rules.in_image`), and reached by the ray through it.
 
         Args:
             camera_to_world: `(n, 4, 4)` habitat poses.
@@ -70,6 +71,24 @@ class Simulator(Protocol):
     def close(self) -> None:
         """Free what the simulator holds."""
         ...
+
+
+ASKED = ("name", "version", "scene", "scene_digest", "scene_frame", "area", "render", "visible", "close")
+"""The members of `Simulator`."""
+
+
+def pictures(simulator: Simulator, camera_to_world: NDArray[np.floating], intrinsics: Intrinsics) -> Frames:
+    """Colour and depth of `(n, 4, 4)` habitat poses.
+
+    Raises:
+        SimulatorError: the simulator shows no colour.
+    """
+    frames = simulator.render(camera_to_world, intrinsics, rgb=True)
+    if frames.rgb is None:
+        raise SimulatorError(
+            f"{simulator.scene}: expected pictures, but the simulator {simulator.name} shows no colour"
+        )
+    return frames
 
 
 @runtime_checkable

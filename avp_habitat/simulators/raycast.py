@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.poses import Intrinsics, pixel_directions
-from avp_habitat.sight.coverage import pairs_in_image
+from avp_habitat.sight.rules import pairs_in_image
 from avp_habitat.simulators.base import Frames
 
 if TYPE_CHECKING:
@@ -56,9 +56,9 @@ class RaycastSimulator:
 
     @cached_property
     def _area(self) -> "NavigableArea":
-        from avp_habitat.navigation.area import build_area
+        from avp_habitat.navigation.build import build_area
         from avp_habitat.navigation.settings import NavigationSettings
-        from avp_habitat.scenes.masks import without_holes
+        from avp_habitat.scenes.mesh import without_holes
 
         solid = without_holes(self._mesh, NavigationSettings.voxel_m)
         own = build_area(solid, self.surface_below)
@@ -229,7 +229,7 @@ class _Rays:
 
     def _go_on(self, rays: NDArray[np.float32], t_hit: NDArray, ids: NDArray, uvs: NDArray) -> None:
         """Replace the hits of `(n, 6)` rays in holes by the next ones behind; all have n rows, and change in place."""
-        from avp_habitat.scenes.masks import is_hole
+        from avp_habitat.scenes.mesh import is_hole
 
         mesh = self._masked
         assert mesh is not None

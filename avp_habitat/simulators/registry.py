@@ -1,6 +1,7 @@
 """The simulators by name, made once per scene and process."""
 
 import gc
+import inspect
 import os
 import weakref
 from collections.abc import Callable
@@ -8,12 +9,35 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from avp_habitat.errors import SimulatorError, UsageError, unknown_name
+from avp_habitat import plugins
+from avp_habitat.errors import SimulatorError, UsageError
 from avp_habitat.scenes.location import UPS
-from avp_habitat.simulators.base import Simulator
+from avp_habitat.simulators.base import ASKED, Simulator
 
-SIMULATOR_NAMES = ("raycast", "habitat")
-_WITH_GPU = "habitat"
+Factory = Callable[..., Simulator]
+"""Opens a scene: `factory(scene, **options)`. It has those of the parameters `gpu`, `navmesh` and `up` that it can use.
+Two attributes say what is asked before a scene is open: `single_rays` (its simulators are `SingleRays`) and
+`one_per_process` (a process can hold one only); False where they are missing."""
+
+
+@plugins.declares(single_rays=True)
+def _raycast(scene: str, *, navmesh: Path | None = None, up: str | None = None) -> Simulator:
+    from avp_habitat.scenes.loader import load_scene
+    from avp_habitat.simulators.raycast import RaycastSimulator
+
+    return RaycastSimulator(load_scene(scene, up=up), navmesh)
+
+
+@plugins.declares(one_per_process=True)
+def _habitat(scene: str, *, gpu: int | None = None, navmesh: Path | None = None, up: str | None = None) -> Simulator:
+    from avp_habitat.simulators.habitat import HabitatSimulator
+
+    return HabitatSimulator(scene, gpu=gpu, navmesh=navmesh, up=up)
+
+
+SIMULATORS: dict[str, Factory] = {"raycast": _raycast, "habitat": _habitat}
+"""What is built in, by name."""
+_OPTIONS = ("gpu", "navmesh", "up")
 
 
 @dataclass(frozen=True)
@@ -25,7 +49,7 @@ class SimulatorChoice:
     """
 
     simulator: str = "raycast"
-    """raycast or habitat (Habitat-Sim)."""
+    """raycast, habitat (Habitat-Sim), MODULE:FACTORY, or another distribution's; in Python also the factory itself."""
     gpu: int | None = None
     """CUDA device that habitat renders on, -1 for none (omitted: the first one that EGL offers)."""
     navmesh: Path | None = None
@@ -37,68 +61,62 @@ class SimulatorChoice:
         """Refuse what cannot work."""
         if self.navmesh is not None:
             object.__setattr__(self, "navmesh", Path(self.navmesh))
-        if self.simulator not in SIMULATOR_NAMES:
-            raise unknown_name("simulator", self.simulator, SIMULATOR_NAMES)
         if self.up not in (None, *UPS):
             raise UsageError(f"up: expected {' or '.join(UPS)}, got {self.up!r}")
         if self.gpu is not None and (isinstance(self.gpu, bool) or not isinstance(self.gpu, int) or self.gpu < -1):
             raise UsageError(f"gpu: expected a CUDA device from 0, or -1 for none, got {self.gpu!r}")
-        if self.gpu is not None and self.simulator != _WITH_GPU:
-            raise UsageError(
-                f"gpu: is of the simulator {_WITH_GPU!r}, but {self.simulator!r} was chosen; leave it out, or choose "
-                f"{_WITH_GPU!r}"
-            )
+        for option in self.options:
+            if not _takes(self.factory, option):
+                able = " or ".join(repr(name) for name, factory in SIMULATORS.items() if _takes(factory, option))
+                chosen = f"but {self.name!r} was chosen; leave it out, or choose {able}"
+                raise UsageError(f"{option}: is of the simulator {able}, {chosen}")
+
+    @property
+    def name(self) -> str:
+        """Of the factory, as a text."""
+        return plugins.name_of(self.simulator)
+
+    @property
+    def factory(self) -> Factory:
+        """Opens scenes."""
+        return plugins.find("avp.simulators", self.simulator, SIMULATORS)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The options that were given."""
+        return {name: value for name in _OPTIONS if (value := getattr(self, name)) is not None}
+
+    @property
+    def single_rays(self) -> bool:
+        """Whether its simulators cast single rays, so that views can be looked up."""
+        return bool(getattr(self.factory, "single_rays", False))
+
+    @property
+    def one_per_process(self) -> bool:
+        """Whether a process can hold one of its simulators only."""
+        return bool(getattr(self.factory, "one_per_process", False))
 
     @classmethod
     def by_name(cls, simulator: object, **options: Any) -> "SimulatorChoice | None":
-        """The choice by name and options; None for simulators that are open already, which take no options.
+        """The choice by name (or factory) and options; None for open simulators, which take no options.
 
         Raises:
             UsageError: as the class, or options beside an open simulator.
         """
-        if isinstance(simulator, str):
-            return cls(simulator, **options)
+        if isinstance(simulator, str) or callable(simulator):
+            return cls(simulator, **options)  # type: ignore[arg-type]
         for option, value in options.items():
             if value is not None:
                 raise UsageError(f"{option}: expected none beside a simulator that is open already, got {value}")
         return None
 
 
-def add_simulator_options(parser: Any) -> None:
-    """Until all commands are read by tyro."""
-    parser.add_argument("--simulator", default="raycast")
-    parser.add_argument("--gpu", default=None, type=int)
-    parser.add_argument("--navmesh", default=None, type=Path)
-    add_up_option(parser)
-
-
-def add_up_option(parser: Any) -> None:
-    """Until all commands are read by tyro."""
-    parser.add_argument("--up", choices=UPS)
-
-
-def simulator_choice(options: Any) -> SimulatorChoice:
-    """Until all commands are read by tyro."""
-    return SimulatorChoice(options.simulator, options.gpu, options.navmesh, options.up)
-
-
-def _raycast(scene: str, choice: SimulatorChoice) -> Simulator:
-    from avp_habitat.scenes.loader import load_scene
-    from avp_habitat.simulators.raycast import RaycastSimulator
-
-    return RaycastSimulator(load_scene(scene, up=choice.up), choice.navmesh)
-
-
-def _habitat(scene: str, choice: SimulatorChoice) -> Simulator:
-    from avp_habitat.simulators.habitat import HabitatSimulator
-
-    return HabitatSimulator(scene, gpu=choice.gpu, navmesh=choice.navmesh, up=choice.up)
+def _takes(factory: Factory, option: str) -> bool:
+    parameters = inspect.signature(factory).parameters.values()
+    return any(each.name == option or each.kind is each.VAR_KEYWORD for each in parameters)
 
 
 _Key = tuple[SimulatorChoice, str, float]
-_FACTORIES: dict[str, Callable[[str, SimulatorChoice], Simulator]] = {"raycast": _raycast, "habitat": _habitat}
-ONE_PER_PROCESS = ("habitat",)
-"""Simulators of which a process can hold one only."""
 # Simulators hold no state of an episode, so all environments of a process on one scene share one; it is freed with
 # the last of them.
 _shared: weakref.WeakValueDictionary[_Key, Simulator] = weakref.WeakValueDictionary()
@@ -108,7 +126,7 @@ def make_simulator(name: str, scene: str | Path, **options: Any) -> Simulator:
     """The simulator `name` on a scene.
 
     Args:
-        name: `raycast` or `habitat`.
+        name: `raycast`, `habitat`, `module:factory`, another distribution's, or the factory itself.
         scene: as `avp_habitat.scenes.location.locate` takes it.
         **options: of `SimulatorChoice`: `gpu` (the CUDA device of `habitat`; -1 for none, None for the first one there
             is), `navmesh` (file of the scene's NavMesh; computed when omitted) and `up` (axis of a mesh file that
@@ -130,10 +148,9 @@ def open_simulator(choice: SimulatorChoice, scene: str | Path) -> Simulator:
     key = (choice, os.path.abspath(path), path.stat().st_mtime) if path.is_file() else (choice, scene, 0.0)
     simulator = _shared.get(key)
     if simulator is None or _is_closed(simulator):
-        if choice.simulator in ONE_PER_PROCESS:
-            _check_alone(choice.simulator, scene)
-        simulator = _FACTORIES[choice.simulator](scene, choice)
-        _shared[key] = simulator
+        if choice.one_per_process:
+            _check_alone(choice, scene)
+        simulator = _shared[key] = _opened(choice, scene)
     return simulator
 
 
@@ -142,21 +159,34 @@ def open_scenes() -> dict[str, str]:
     return {simulator.scene: simulator.scene_digest for simulator in list(_shared.values())}
 
 
-def _check_alone(name: str, scene: str) -> None:
+def _opened(choice: SimulatorChoice, scene: str) -> Simulator:
+    try:
+        inspect.signature(choice.factory).bind(scene, **choice.options)
+    except TypeError as error:
+        raise UsageError(
+            f"simulator {choice.name!r}: expected a factory of (scene, gpu, navmesh, up): {error}"
+        ) from None
+    simulator = choice.factory(scene, **choice.options)
+    if missing := [each for each in ASKED if each not in dir(simulator)]:
+        raise UsageError(f"simulator {choice.name!r}: {type(simulator).__name__} has no {', '.join(missing)}")
+    return simulator
+
+
+def _check_alone(choice: SimulatorChoice, scene: str) -> None:
     """Refuse a second simulator before it is made, where a process can hold one only."""
-    if not _open_already(name):
+    if not _open_already(choice):
         return
     gc.collect()  # An environment that nobody uses any more may be left in a circle of references.
-    if found := _open_already(name):
+    if found := _open_already(choice):
         raise SimulatorError(
-            f"{name}: a process can hold one simulator, and this one has {found[0]} open already, so that {scene} "
-            'needs a process of its own: SubprocVecEnv(start_method="forkserver"), or avp_sb3.AVPSubprocVecEnv for '
-            'several scenes; simulator="raycast" has no such limit'
+            f"{choice.name}: a process can hold one simulator, and this one has {found[0]} open already, so that "
+            f'{scene} needs a process of its own: SubprocVecEnv(start_method="forkserver"), or '
+            'avp_sb3.AVPSubprocVecEnv for several scenes; simulator="raycast" has no such limit'
         )
 
 
-def _open_already(name: str) -> list[str]:
-    opened = [simulator for (choice, _, _), simulator in list(_shared.items()) if choice.simulator == name]
+def _open_already(choice: SimulatorChoice) -> list[str]:
+    opened = [simulator for (other, _, _), simulator in list(_shared.items()) if other.simulator == choice.simulator]
     return [simulator.scene for simulator in opened if not _is_closed(simulator)]
 
 

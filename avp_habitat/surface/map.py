@@ -7,6 +7,7 @@ do not change them.
 import numpy as np
 from numpy.typing import NDArray
 
+from avp_habitat.compiled import njit
 from avp_habitat.surface.points import SceneSurface
 
 SIDE = 10
@@ -57,11 +58,48 @@ class SurfaceMapper:
         Returns:
             `(k, SIZE)` within [0, 1], channel after channel, row after row from ahead to behind, left to right.
         """
-        from avp_habitat.task.observations import draw_surface
-
         maps = np.zeros((len(rows), len(GROUPS), 2, SIDE, SIDE), dtype=np.float32)
         eye = np.asarray(position) + [0.0, self._height_m, 0.0]
-        draw_surface(self._points, self._facing, quality, rows, eye, np.asarray(yaw), CELL_M, maps)
+        _draw(self._points, self._facing, quality, rows, eye, np.asarray(yaw), CELL_M, maps)
         maps[:, :, 1] /= np.maximum(maps[:, :, 0], 1.0)
         maps[:, :, 0] /= FULL
         return np.minimum(maps, 1.0).reshape(len(rows), SIZE)
+
+
+@njit(cache=True)
+def _draw(points, facing, quality, rows, eye, yaw, cell_m, maps):
+    """Count the surface points seen, and sum their qualities, by group and map cell.
+
+    Args:
+        points: `(m, 3)` metres.
+        facing: `(m,)` 1 up, 0 sideways, -1 down.
+        quality: `(n, m)` how well each was seen, 0 for never.
+        rows: `(k,)` the agents' rows of it.
+        eye: `(k, 3)` the agents' cameras, metres.
+        yaw: `(k,)` radians.
+        cell_m: side of a map cell, metres.
+        maps: `(k, 4, 2, side, side)` output, zeros before.
+    """
+    side = maps.shape[3]
+    for k in range(len(rows)):
+        seen = quality[rows[k]]
+        ahead_x, ahead_z = -np.sin(yaw[k]) / cell_m, -np.cos(yaw[k]) / cell_m
+        for j in range(len(points)):
+            if seen[j] > 0:
+                x, z = points[j, 0] - eye[k, 0], points[j, 2] - eye[k, 2]
+                ahead, right = x * ahead_x + z * ahead_z, z * ahead_x - x * ahead_z
+                row, column = int(np.floor(side / 2 - ahead)), int(np.floor(side / 2 + right))
+                if 0 <= row < side and 0 <= column < side:
+                    group = _group(facing[j], points[j, 1] - eye[k, 1])
+                    maps[k, group, 0, row, column] += 1
+                    maps[k, group, 1, row, column] += seen[j]
+
+
+@njit(cache=True)
+def _group(facing, height):
+    """Number of `GROUPS` for a point at a height from the camera."""
+    if facing > 0:
+        return 0
+    if facing < 0:
+        return 3
+    return 1 if height < 0 else 2

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import UsageError, unknown_name
 from avp_habitat.poses import Intrinsics
-from avp_habitat.simulators.base import Frames, Simulator
+from avp_habitat.simulators.base import Frames, Simulator, pictures
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.task.agent_view import AgentView
-from avp_habitat.task.observations import action_space, observation_space
+from avp_habitat.task.observations import Observed, action_space, each
 from avp_habitat.task.settings import ACTION_NAMES, TaskSettings
 from avp_habitat.task.task import StepOutcome, ViewpointTask
 from avp_habitat.task.trajectory import episode_metrics
@@ -23,19 +23,17 @@ RENDER_MODES = ("rgb_array",)
 _PICTURE = (480, 360)
 
 
-class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
+class AVPEnv(gymnasium.Env[Observed, np.int64]):
     """An agent that walks through a scene and decides which views to take.
 
-    Observations are the twelve numbers of `observation.NAMES`, with `observation="map"` followed by a map of what was
-    seen of the floor, with `"surface_map"` by those of walls, furniture and ceiling too; actions are the six of
-    `settings.ACTION_NAMES`. `info` of every step holds `coverage`, `new_cells`, `views`, `collided`, `redundant` and
-    `reward_parts`; the last step of an episode adds `avp_episode` (figures, see `trajectory.episode_metrics`),
-    `avp_trajectory` and `is_success`.
+    Observations are the twelve numbers of `observations.NAMES`, with `observation="map"` followed by a map of what was
+    seen of the floor, with `"surface_map"` by those of walls, furniture and ceiling too, or of one's own kind; actions
+    are the six of `settings.ACTION_NAMES`. `info` of every step holds `coverage`, `new_cells`, `views`, `collided`,
+    `redundant` and `reward_parts`; the last step of an episode adds `avp_episode` (figures, see
+    `trajectory.episode_metrics`), `avp_trajectory` and `is_success`.
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 4}  # noqa: RUF012 - gymnasium's own declaration
-    failure = None
-    """Why there is no scene; that of a `worker_env.UnopenedEnv` says it."""
 
     def __init__(
         self,
@@ -53,13 +51,15 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
 
         Args:
             scene: as `avp_habitat.scenes.location.locate` takes it.
-            simulator: `raycast`, `habitat`, or one that is open already (the scene's name is then its own).
+            simulator: `raycast`, `habitat`, `module:factory`, another distribution's, or one that is open already (the
+                scene's name is then its own).
             gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
             navmesh: file of the scene's NavMesh; computed when omitted.
             up: axis of mesh files that points up, `y` or `z`; of each file what is known of it when omitted.
             render_mode: None, or `rgb_array`: the camera's picture beside the top-down map.
             settings: of the task; the design's defaults when omitted.
-            **overrides: single fields of `TaskSettings`, for example `reward="coverage"`, `budget=60`, `width=64`.
+            **overrides: single fields of `TaskSettings`, for example `reward="coverage"`, `budget=60`,
+                `observation="my_module:MyObservation"`.
 
         Raises:
             UsageError: an unknown name or a value that cannot be right.
@@ -72,9 +72,9 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         self.choice = SimulatorChoice.by_name(simulator, gpu=gpu, navmesh=navmesh, up=up)
         """How the simulator was chosen; None for one that was open already."""
         self.render_mode = render_mode
-        self.observation_space = observation_space(self.settings.observation)
         self.action_space = action_space()
         self._enter(scene, simulator)
+        self.observation_space = self._task.kind.space
 
     def change_scene(self, scene: str | Path) -> None:
         """Leave the scene for another one in the same kind of simulator; `reset` starts there.
@@ -128,7 +128,7 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[Observed, dict[str, Any]]:
         """Start an episode at a random navigable point and heading.
 
         Args:
@@ -148,9 +148,9 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
             yaw = np.array([float(options["yaw"])])
         observation = self._task.reset([0], position, yaw)
         self._running = True
-        return observation[0], {"coverage": 0.0, "views": 0}
+        return each(_first, observation), {"coverage": 0.0, "views": 0}
 
-    def step(self, action: np.int64 | int) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.int64 | int) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
         """Do one action and capture one view.
 
         Raises:
@@ -165,7 +165,7 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         info = step_info(self._task, outcome)[0]
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         self._running = not (terminated or truncated)
-        return outcome.observation[0], float(outcome.reward[0]), terminated, truncated, info
+        return each(_first, outcome.observation), float(outcome.reward[0]), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """The camera's picture beside the top-down map, `(h, w, 3)`; None without a render mode."""
@@ -180,7 +180,7 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
 
     def capture(self, camera_to_world: NDArray[np.floating], intrinsics: Intrinsics) -> Frames:
         """Pictures and depth of `(n, 4, 4)` habitat poses, without any effect on the episode."""
-        return self.simulator.render(camera_to_world, intrinsics, rgb=True)
+        return pictures(self.simulator, camera_to_world, intrinsics)
 
     def close(self) -> None:
         """End the episode; the simulator is shared and goes with its last user."""
@@ -207,6 +207,10 @@ class AVPEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         return point
 
 
+def _first(values: NDArray[Any]) -> Any:
+    return values[0]
+
+
 def step_info(task: ViewpointTask, outcome: StepOutcome) -> list[dict[str, Any]]:
     """`info` of all agents' steps; those whose episode ends there get its figures and trajectory."""
     facts = outcome.facts
@@ -230,7 +234,7 @@ def step_info(task: ViewpointTask, outcome: StepOutcome) -> list[dict[str, Any]]
     for row in np.flatnonzero(outcome.terminated | outcome.truncated):
         stopped = bool(outcome.terminated[row])
         trajectory = task.trajectory(int(row))
-        infos[row]["avp_episode"] = episode_metrics(trajectory, stopped=stopped)
+        infos[row]["avp_episode"] = episode_metrics(trajectory, stopped=stopped, further=task.settings.metrics)
         infos[row]["avp_trajectory"] = trajectory
         infos[row]["is_success"] = stopped
     return infos

@@ -1,15 +1,152 @@
-"""The spaces of `AVP-v0` as gymnasium describes them."""
+"""What a policy observes: the kinds that are built in, and what every kind is computed from."""
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from avp_habitat.compiled import njit
+from avp_habitat import plugins
+from avp_habitat.errors import UsageError
 from avp_habitat.navigation.area import NavigableArea
-from avp_habitat.surface.map import SIZE as SURFACE_SIZE
-from avp_habitat.task.settings import ACTION_NAMES
+from avp_habitat.simulators.base import Frames, Simulator
+from avp_habitat.surface import map as surface_map
+from avp_habitat.surface.memory import RoomSurface
+from avp_habitat.task import floor_map
+from avp_habitat.task.settings import ACTION_NAMES, OBSERVATIONS, TaskSettings
+from avp_habitat.task.views import Views
 
 Float = NDArray[np.floating]
+Observed = Any
+"""Arrays whose first axis is the agents: one, or a `dict` of them as the space is a `Dict`."""
+
+
+@dataclass(frozen=True)
+class SceneAgents:
+    """Those k of the agents that are in one scene; every array's first axis is k."""
+
+    simulator: Simulator
+    """Of the scene."""
+    chosen: NDArray[np.integer]
+    """`(k,)` their numbers among all n agents."""
+    views: Views
+    """Where they stand and look."""
+    _rows: NDArray[np.integer]
+    _first_seen: NDArray[np.int16]
+    _floor: floor_map.MapObserver
+    _surface: RoomSurface | None
+
+    @property
+    def area(self) -> NavigableArea:
+        """The scene's floor; which cells of it an agent knows is `first_seen`."""
+        return self.simulator.area
+
+    @property
+    def first_seen(self) -> NDArray[np.int16]:
+        """`(k, m)` for each of `area.centres` the step (from 1) whose view first observed it; 0 for never."""
+        return self._first_seen[self._rows, : len(self.area.centres)]
+
+    def floor_maps(self) -> NDArray[np.float32]:
+        """As `Agents.floor_maps`."""
+        side, views = floor_map.SIDE, self.views
+        maps = self._floor.observe(self._first_seen, self._rows, views.position, views.yaw)
+        return maps.reshape(-1, len(floor_map.CHANNELS), side, side)
+
+    def surface_maps(self) -> NDArray[np.float32]:
+        """As `Agents.surface_maps`."""
+        if self._surface is None:
+            raise UsageError("surface_maps: the observation has to declare that by needs_surface = True")
+        maps = self._surface.observe(self._rows, self.views.position, self.views.yaw)
+        return maps.reshape(-1, len(surface_map.CHANNELS), surface_map.SIDE, surface_map.SIDE)
+
+
+@dataclass(frozen=True)
+class Agents:
+    """n agents at this moment, from which observations are computed; every array's first axis is n.
+
+    Methods compute what they return, for those kinds of observation that ask for it.
+    """
+
+    settings: TaskSettings
+    """Of the task."""
+    steps: NDArray[np.int64]
+    """`(n,)` t: views taken so far in the episode."""
+    start: Float
+    """`(n, 3)` where the episode began, metres."""
+    position: Float
+    """`(n, 3)` the feet, metres."""
+    yaw: Float
+    """`(n,)` radians, left positive."""
+    pitch: Float
+    """`(n,)` radians, up positive."""
+    min_depth: Float
+    """`(n,)` least depth of the newest view, a share of the range."""
+    mean_depth: Float
+    """`(n,)` mean depth of the newest view, a share of the range."""
+    coverage: Float
+    """`(n,)` C, within [0, 1]."""
+    collided: NDArray[np.bool_]
+    """`(n,)` whether the newest step was a blocked forward move."""
+    spread_m: Float
+    """`(n,)` ‖p − p̄‖ in metres."""
+    diameter_m: Float
+    """`(n,)` r: diameter of the scene's navigable area, metres."""
+    _by_scene: Callable[[], list[SceneAgents]]
+
+    @cached_property
+    def scenes(self) -> list[SceneAgents]:
+        """The same agents scene by scene, with what was seen there."""
+        return self._by_scene()
+
+    def floor_maps(self) -> NDArray[np.float32]:
+        """`(n, 3, 20, 20)` within [0, 1], `floor_map.CHANNELS`: the observed floor around each agent, ahead is up."""
+        return self.joined([scene.floor_maps() for scene in self.scenes])
+
+    def surface_maps(self) -> NDArray[np.float32]:
+        """`(n, 8, 10, 10)` within [0, 1], `surface.map.CHANNELS`: walls, furniture and ceiling that were seen.
+
+        Raises:
+            UsageError: the observation does not declare `needs_surface = True`.
+        """
+        return self.joined([scene.surface_maps() for scene in self.scenes])
+
+    def images(self, *, rgb: bool = False) -> Frames:
+        """The newest views again: `(n, h, w)` depth of the size in `settings`, and colour when asked for; slow."""
+        seen = [
+            scene.simulator.render(scene.views.camera_to_world, self.settings.intrinsics, rgb=rgb)
+            for scene in self.scenes
+        ]
+        colour = self.joined([each.rgb for each in seen]) if all(each.rgb is not None for each in seen) else None
+        return Frames(colour, self.joined([each.depth for each in seen]))
+
+    def joined(self, parts: list[Any]) -> NDArray[Any]:
+        """`(n, …)` from the `(k, …)` arrays of each of `scenes`."""
+        if len(parts) == 1:
+            return parts[0]
+        whole = np.empty((len(self.steps), *parts[0].shape[1:]), parts[0].dtype)
+        for scene, part in zip(self.scenes, parts, strict=True):
+            whole[scene.chosen] = part
+        return whole
+
+
+class Observation(Protocol):
+    """A kind of observation; a class is made for each task by `Kind(settings)`.
+
+    An attribute `needs_surface = True` declares that `Agents.surface_maps` is used.
+    """
+
+    space: gymnasium.Space[Any]
+    """Of one agent's observation; a `Dict` is for `MultiInputPolicy`."""
+
+    def __call__(self, agents: Agents) -> Observed:
+        """Observations of n agents as the space says, with a first axis of n."""
+        ...
+
 
 NAMES = (
     "t / T",
@@ -30,219 +167,121 @@ LOW = np.array([0, -1, -1, -1, -1, -1, -1, 0, 0, 0, 0, 0], dtype=np.float32)
 HIGH = np.ones(12, dtype=np.float32)
 
 
-def depth_statistics(depth: Float, max_range_m: float) -> tuple[Float, Float]:
-    """Least and mean depth as shares of the range, `(n,)` each, clipped to [0, 1].
-
-    Args:
-        depth: `(n, h, w)` planar depth in metres, 0 where nothing was hit, which counts as the whole range.
-        max_range_m: what the value 1 stands for.
-    """
-    shares = np.where(depth > 0, np.minimum(depth / max_range_m, 1.0), 1.0).reshape(len(depth), -1)
-    return shares.min(axis=1), shares.mean(axis=1)
-
-
-def observation(
-    *,
-    progress: Float,
-    offset: Float,
-    yaw: Float,
-    pitch: Float,
-    min_depth: Float,
-    mean_depth: Float,
-    coverage: Float,
-    collided: NDArray[np.bool_],
-    spread: Float,
-) -> NDArray[np.float32]:
-    """Observations of n agents in the order of `NAMES`.
-
-    Args:
-        progress: `(n,)` t / T.
-        offset: `(n, 2)` x and z from the start, in units of r.
-        yaw: `(n,)` radians, left positive.
-        pitch: `(n,)` radians, up positive.
-        min_depth: `(n,)` share of 10 m.
-        mean_depth: `(n,)` share of 10 m.
-        coverage: `(n,)` within [0, 1].
-        collided: `(n,)` whether the last step did.
-        spread: `(n,)` ‖p − p̄‖ in units of r.
-
-    Returns:
-        `(n, 12)` float32 within [`LOW`, `HIGH`].
-    """
+def numbers(agents: Agents) -> NDArray[np.float32]:
+    """`(n, 12)` the numbers `NAMES` within [`LOW`, `HIGH`]."""
+    offset = (agents.position - agents.start)[:, [0, 2]] / agents.diameter_m[:, None]
     columns = [
-        progress,
+        agents.steps / agents.settings.budget,
         offset[:, 0],
         offset[:, 1],
-        np.sin(yaw),
-        np.cos(yaw),
-        np.sin(pitch),
-        np.cos(pitch),
-        min_depth,
-        mean_depth,
-        coverage,
-        collided,
-        spread,
+        np.sin(agents.yaw),
+        np.cos(agents.yaw),
+        np.sin(agents.pitch),
+        np.cos(agents.pitch),
+        agents.min_depth,
+        agents.mean_depth,
+        agents.coverage,
+        agents.collided,
+        agents.spread_m / agents.diameter_m,
     ]
     return np.clip(np.stack(columns, axis=1).astype(np.float32), LOW, HIGH)
 
 
-OBSERVED, FRONTIER, RIM = range(3)
+class Numbers:
+    """The twelve numbers of the design."""
+
+    further = 0
+
+    def __init__(self, settings: TaskSettings) -> None:
+        """Say the space."""
+        low, high = np.zeros(self.further, np.float32), np.ones(self.further, np.float32)
+        self.space = Box(np.concatenate([LOW, low]), np.concatenate([HIGH, high]), dtype=np.float32)
+
+    def __call__(self, agents: Agents) -> NDArray[np.float32]:
+        """`(n, 12 + further)` float32."""
+        return np.concatenate([numbers(agents), *self._further(agents)], axis=1)
+
+    def _further(self, agents: Agents) -> list[NDArray[np.float32]]:
+        return []
 
 
-@njit(cache=True)
-def draw(index, first_seen, rows, place, yaw, scale, maps):
-    """Count floor cells by channel and map cell.
+class Map(Numbers):
+    """The numbers, whether C ≥ τ, and the map of the floor."""
 
-    Args:
-        index: `(rows + 2, columns + 2)` number of each navigable cell, -1 elsewhere, with a border of -1.
-        first_seen: `(n, >= m)` 0 for cells not observed.
-        rows: `(k,)` the agents' rows of it.
-        place: `(k, 2)` x and z of the agents in floor cells from the grid's corner.
-        yaw: `(k,)` radians.
-        scale: floor cells along a map cell's side.
-        maps: `(k, 3, side, side)` output, zeros before.
+    further = 1 + floor_map.SIZE
+
+    def _further(self, agents: Agents) -> list[NDArray[np.float32]]:
+        enough = agents.coverage >= agents.settings.constants.stop_coverage
+        return [enough[:, None].astype(np.float32), agents.floor_maps().reshape(-1, floor_map.SIZE)]
+
+
+class SurfaceMap(Map):
+    """`Map`, and the maps of the surface."""
+
+    needs_surface = True
+    further = Map.further + surface_map.SIZE
+
+    def _further(self, agents: Agents) -> list[NDArray[np.float32]]:
+        return [*super()._further(agents), agents.surface_maps().reshape(-1, surface_map.SIZE)]
+
+
+def make_observation(settings: TaskSettings) -> Observation:
+    """The kind of observation that the settings name; those of users are held to their spaces.
+
+    Raises:
+        UsageError: no such kind, or it has no space or cannot be called with the agents.
     """
-    for k in range(len(rows)):
-        seen = first_seen[rows[k]]
-        ahead_x, ahead_z = -np.sin(yaw[k]) / scale, -np.cos(yaw[k]) / scale
-        for i in range(1, index.shape[0] - 1):
-            for j in range(1, index.shape[1] - 1):
-                if index[i, j] >= 0 and seen[index[i, j]] != 0:
-                    x, z = j - 0.5 - place[k, 0], i - 0.5 - place[k, 1]
-                    ahead, right = x * ahead_x + z * ahead_z, z * ahead_x - x * ahead_z
-                    _enter(maps[k], ahead, right, *_edges(index, seen, i, j))
+    name = plugins.name_of(settings.observation)
+    kind = plugins.find("avp.observations", settings.observation, OBSERVATIONS)
+    try:
+        if isinstance(kind, type):
+            inspect.signature(kind).bind(settings)
+            kind = kind(settings)
+        inspect.signature(kind).bind("agents")
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"observation {name!r}: expected Kind(settings), called with the agents: {error}") from None
+    if not isinstance(space := getattr(kind, "space", None), gymnasium.Space):
+        raise UsageError(f"observation {name!r}: expected a gymnasium space as its `space`, got {space!r}")
+    return kind if name in OBSERVATIONS else _Held(kind, name)
 
 
-@njit(cache=True)
-def _edges(index, seen, i, j):
-    """Whether an observed cell lies beside floor not yet observed, and beside what is not navigable."""
-    frontier, rim = False, False
-    for di, dj in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-        other = index[i + di, j + dj]
-        if other < 0:
-            rim = True
-        elif seen[other] == 0:
-            frontier = True
-    return frontier, rim
+class _Held:
+    """A kind of observation whose arrays are held to its space."""
+
+    def __init__(self, kind: Observation, name: str) -> None:
+        self.space, self._kind, self._name = kind.space, kind, name
+
+    def __call__(self, agents: Agents) -> Observed:
+        return _fitted(self.space, self._kind(agents), len(agents.steps), f"observation {self._name!r}")
 
 
-@njit(cache=True)
-def _enter(channels, ahead, right, frontier, rim):
-    """Count an observed cell at a place in map cells from the agent; frontiers beyond the map on its border."""
-    side = channels.shape[1]
-    row, column = int(np.floor(side / 2 - ahead)), int(np.floor(side / 2 + right))
-    if 0 <= row < side and 0 <= column < side:
-        channels[OBSERVED, row, column] += 1
-        channels[RIM, row, column] += rim
-    if frontier:
-        channels[FRONTIER, min(max(row, 0), side - 1), min(max(column, 0), side - 1)] += 1
+def _fitted(space: gymnasium.Space[Any], value: Any, agents: int, where: str) -> Observed:
+    """The value with the space's type of number; floats of 64 bits may become such of 32, but no whole numbers."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        if not isinstance(value, Mapping) or set(value) != set(space.spaces):
+            got = sorted(value) if isinstance(value, Mapping) else type(value).__name__
+            raise UsageError(f"{where}: expected arrays by the names {sorted(space.spaces)}, got {got}")
+        return {part: _fitted(each, value[part], agents, f"{where}: {part}") for part, each in space.spaces.items()}
+    array, shape = np.asarray(value), (agents, *(space.shape or ()))
+    if array.shape != shape or not np.can_cast(array.dtype, space.dtype or array.dtype, "same_kind"):
+        raise UsageError(f"{where}: expected {space.dtype} of shape {shape}, got {array.dtype} of shape {array.shape}")
+    array = array.astype(space.dtype, copy=False)
+    bounds = isinstance(space, Box)
+    inside = (array >= space.low) & (array <= space.high) if bounds else np.array([*map(space.contains, array)])
+    if not inside.all():
+        raise UsageError(f"{where}: expected values within {_range(space)}, got {array[~inside].flat[0]}")
+    return array
 
 
-@njit(cache=True)
-def draw_surface(points, facing, quality, rows, eye, yaw, cell_m, maps):
-    """Count the surface points seen, and sum their qualities, by group and map cell.
-
-    Args:
-        points: `(m, 3)` metres.
-        facing: `(m,)` 1 up, 0 sideways, -1 down.
-        quality: `(n, m)` how well each was seen, 0 for never.
-        rows: `(k,)` the agents' rows of it.
-        eye: `(k, 3)` the agents' cameras, metres.
-        yaw: `(k,)` radians.
-        cell_m: side of a map cell, metres.
-        maps: `(k, 4, 2, side, side)` output, zeros before.
-    """
-    side = maps.shape[3]
-    for k in range(len(rows)):
-        seen = quality[rows[k]]
-        ahead_x, ahead_z = -np.sin(yaw[k]) / cell_m, -np.cos(yaw[k]) / cell_m
-        for j in range(len(points)):
-            if seen[j] > 0:
-                x, z = points[j, 0] - eye[k, 0], points[j, 2] - eye[k, 2]
-                ahead, right = x * ahead_x + z * ahead_z, z * ahead_x - x * ahead_z
-                row, column = int(np.floor(side / 2 - ahead)), int(np.floor(side / 2 + right))
-                if 0 <= row < side and 0 <= column < side:
-                    group = _group(facing[j], points[j, 1] - eye[k, 1])
-                    maps[k, group, 0, row, column] += 1
-                    maps[k, group, 1, row, column] += seen[j]
+def _range(space: gymnasium.Space[Any]) -> str:
+    return f"[{space.low.min():g}, {space.high.max():g}]" if isinstance(space, Box) else str(space)
 
 
-@njit(cache=True)
-def _group(facing, height):
-    """Number of `surface_map.GROUPS` for a point at a height from the camera."""
-    if facing > 0:
-        return 0
-    if facing < 0:
-        return 3
-    return 1 if height < 0 else 2
-
-
-SIDE = 20
-"""Map cells along a side; the agent stands in the middle, its heading points to row 0."""
-CELL_M = 0.4
-"""Side of a map cell in metres."""
-CHANNELS = ("observed", "frontier", "rim")
-"""observed: share of the map cell's ground that is observed floor. frontier: observed floor beside floor that is not
-yet observed. rim: observed floor beside what is not navigable. The last two are lengths in sides of a map cell, up to
-1."""
-SIZE = len(CHANNELS) * SIDE * SIDE
-
-
-class MapObserver:
-    """Draws the maps of agents in one scene."""
-
-    def __init__(self, area: NavigableArea) -> None:
-        """Number the scene's cells."""
-        self._origin = area.origin
-        self._cell_m = area.cell_m
-        # A border of cells outside, so that every cell has four neighbours.
-        self._index = np.full((area.mask.shape[0] + 2, area.mask.shape[1] + 2), -1, dtype=np.int32)
-        self._index[1:-1, 1:-1][area.mask] = np.arange(np.count_nonzero(area.mask))
-
-    def observe(
-        self,
-        first_seen: NDArray[np.int16],
-        rows: NDArray[np.integer],
-        position: NDArray[np.floating],
-        yaw: NDArray[np.floating],
-    ) -> NDArray[np.float32]:
-        """The maps of k agents.
-
-        Args:
-            first_seen: `(n, >= m)` 0 for cells not observed.
-            rows: `(k,)` the agents' rows of it.
-            position: `(k, 3)` their feet, metres.
-            yaw: `(k,)` radians.
-
-        Returns:
-            `(k, SIZE)` within [0, 1], channel after channel, row after row from ahead to behind, left to right. What
-            lies beyond the map is drawn on its border, frontiers only.
-        """
-        pass
-
-        maps = np.zeros((len(rows), len(CHANNELS), SIDE, SIDE), dtype=np.float32)
-        place = (np.asarray(position)[:, [0, 2]] - self._origin) / self._cell_m
-        per_side = CELL_M / self._cell_m
-        draw(self._index, first_seen, rows, place, np.asarray(yaw), per_side, maps)
-        maps[:, 0] /= per_side**2
-        maps[:, 1:] /= per_side
-        return np.minimum(maps, 1.0).reshape(len(rows), SIZE)
-
-
-def observation_space(kind: str) -> gymnasium.Space[NDArray[np.float32]]:
-    """Observations of a kind.
-
-    Args:
-        kind: one of `settings.OBSERVATION_NAMES`.
-
-    Returns:
-        float32; `(12,)` for `numbers`, `(13 + map_observation.SIZE,)` (the numbers, whether C ≥ τ, the map) for `map`,
-        and `surface_map.SIZE` more for `surface_map`.
-    """
-    further = {"map": 1 + SIZE, "surface_map": 1 + SIZE + SURFACE_SIZE}.get(kind, 0)
-    low = np.concatenate([LOW, np.zeros(further, np.float32)])
-    high = np.concatenate([HIGH, np.ones(further, np.float32)])
-    return gymnasium.spaces.Box(low, high, dtype=np.float32)  # type: ignore[return-value]
+def each(function: Callable[..., Any], *observed: Observed) -> Observed:
+    """A function of arrays applied to observations, part by part where they are dicts."""
+    if isinstance(observed[0], dict):
+        return {part: each(function, *(value[part] for value in observed)) for part in observed[0]}
+    return function(*observed)
 
 
 def action_space() -> gymnasium.spaces.Discrete:

@@ -1,13 +1,15 @@
 """The rewards of the task as sums of named parts, for n agents at a time."""
 
+import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat import plugins
+from avp_habitat.errors import UsageError
 from avp_habitat.ranges import Range, hold_ranges
 
 Float = NDArray[np.floating]
@@ -82,12 +84,29 @@ class StepFacts:
     """T − t after the step."""
 
 
-def _coverage(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
+RewardFunction = Callable[[StepFacts, RewardConstants], Mapping[str, Number | float]]
+"""Gives a step's parts by any names, each one finite number per agent or one for all; the reward is their sum. A step
+may leave some out, but not all."""
+
+
+def reward(*, needs_surface: bool = False, stops: bool = False) -> Callable[[plugins.Function], plugins.Function]:
+    """Declare what a `RewardFunction` needs; one without this decorator needs neither.
+
+    Args:
+        needs_surface: `StepFacts.new_surface` is computed, which takes time.
+        stops: the action stop ends the episode where C ≥ τ; elsewhere it is "no movement".
+    """
+    return plugins.declares(needs_surface=needs_surface, stops=stops)
+
+
+@reward()
+def coverage(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """Eq. 24: α·Δc − P_collision."""
     return {"coverage": constants.alpha * facts.new_cells, "collision": -constants.collision * facts.collided}
 
 
-def _coverage_redundancy(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
+@reward()
+def coverage_redundancy(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """Eq. 25: α·Δc + λ_s·min(‖p − p̄‖, r_max) − P_redundancy − P_collision."""
     return {
         "coverage": constants.alpha * facts.new_cells,
@@ -97,25 +116,26 @@ def _coverage_redundancy(facts: StepFacts, constants: RewardConstants) -> dict[s
     }
 
 
-def _proposed(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
+@reward(stops=True)
+def proposed(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """Eq. 19–22: sublinear, visit-discounted coverage with dispersion, step cost and a learned stop."""
-    new = {"coverage": _new(facts.new_cells, constants.alpha_proposed, facts, constants)}
-    return new | _with_ends(facts, constants)
+    new = _discounted(facts.new_cells, constants.alpha_proposed, facts, constants)
+    return {"coverage": new} | _costs_and_stop(facts, constants)
 
 
-def _surface(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
+@reward(needs_surface=True, stops=True)
+def surface(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """`proposed` with new surface ΔS in place of new cells Δc."""
-    return {"surface": _new(facts.new_surface, constants.alpha_surface, facts, constants)} | _with_ends(
-        facts, constants
-    )
+    new = _discounted(facts.new_surface, constants.alpha_surface, facts, constants)
+    return {"surface": new} | _costs_and_stop(facts, constants)
 
 
-def _new(amount: Number, alpha: float, facts: StepFacts, constants: RewardConstants) -> Number:
+def _discounted(amount: Number, alpha: float, facts: StepFacts, constants: RewardConstants) -> Number:
     """α / (1 + 0.5·v) · amount^β."""
     return alpha / (1 + constants.visit_decay * facts.earlier_visits) * np.power(amount, constants.beta)
 
 
-def _with_ends(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
+def _costs_and_stop(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """What `proposed` and `surface` share: dispersion, costs and the stop."""
     success = constants.stop_bonus + constants.stop_per_step_left * facts.steps_left
     stop = np.where(stops_episode(facts, constants), success, -constants.early_stop)
@@ -132,32 +152,45 @@ def _spread(facts: StepFacts, constants: RewardConstants) -> Number:
     return constants.spread * np.minimum(facts.spread_m, constants.spread_limit_m)
 
 
-REWARDS: dict[str, Callable[[StepFacts, RewardConstants], Mapping[str, Number | float]]] = {
-    "coverage": _coverage,
-    "coverage_redundancy": _coverage_redundancy,
-    "proposed": _proposed,
-    "surface": _surface,
+REWARDS: dict[str, RewardFunction] = {
+    "coverage": coverage,
+    "coverage_redundancy": coverage_redundancy,
+    "proposed": proposed,
+    "surface": surface,
 }
-"""By name: what gives a step's parts, each one number per agent or one for all; their sum is the reward. The parts
-may have any names, and a step may leave some out. A further entry is a further reward."""
-REWARD_NAMES = tuple(REWARDS)
-_WITH_STOP = frozenset({"proposed", "surface"})
+"""What is built in, by name."""
+REWARDS_HELP = f"{', '.join(REWARDS)} or MODULE:FUNCTION"
+"""Help of the option `--reward`."""
 
 
-def check_reward(name: str) -> str:
-    """The name itself when it is a reward's.
+def find_reward(reward: str | RewardFunction) -> RewardFunction:
+    """The function of a reward.
+
+    Args:
+        reward: a name as `plugins.find` takes it, or the function itself.
 
     Raises:
-        UsageError: it is not; the text names the nearest one.
+        UsageError: no such reward, or it is no function of a step's facts and the constants.
     """
-    if name not in REWARDS:
-        raise unknown_name("reward", name, REWARD_NAMES)
-    return name
+    found = plugins.find("avp.rewards", reward, REWARDS)
+    try:
+        inspect.signature(found).bind("facts", "constants")
+    except (TypeError, ValueError) as error:
+        raise UsageError(
+            f"reward {plugins.name_of(reward)!r}: expected a function of (facts, constants), got "
+            f"{plugins.name_of(found)}: {error}"
+        ) from None
+    return found
 
 
-def has_stop(name: str) -> bool:
+def needs_surface(thing: Any) -> bool:
+    """Whether a reward's function or an observation declares that it needs what was seen of the surface."""
+    return bool(getattr(thing, "needs_surface", False))
+
+
+def has_stop(reward: RewardFunction) -> bool:
     """Whether the stop action is available under this reward; elsewhere it is "no movement"."""
-    return name in _WITH_STOP
+    return bool(getattr(reward, "stops", False))
 
 
 def stops_episode(facts: StepFacts, constants: RewardConstants) -> Bool:
@@ -165,30 +198,39 @@ def stops_episode(facts: StepFacts, constants: RewardConstants) -> Bool:
     return facts.stop_chosen & (facts.coverage >= constants.stop_coverage)
 
 
-def reward_parts(name: str, facts: StepFacts, constants: RewardConstants) -> dict[str, NDArray[np.float64]]:
+def reward_parts(
+    reward: RewardFunction, facts: StepFacts, constants: RewardConstants
+) -> dict[str, NDArray[np.float64]]:
     """The parts of a reward, `(n,)` each, as its function names them; the reward is their sum.
 
     Args:
-        name: one of `REWARD_NAMES`.
+        reward: as `find_reward` gives it.
         facts: of one step of n agents.
         constants: of all rewards.
 
     Raises:
-        UsageError: no such reward, or a part is neither one finite number for each agent nor one for all of them.
+        UsageError: there is no part, or one is neither one finite number for each agent nor one for all of them.
     """
-    parts = REWARDS[check_reward(name)](facts, constants)
-    if not isinstance(parts, Mapping):
-        raise UsageError(f"reward {name}: expected parts by name, as {{'new': …}}, got {type(parts).__name__}")
-    return {part: _for_each(len(facts.coverage), value, f"{name}: part {part!r}") for part, value in parts.items()}
+    parts = reward(facts, constants)
+    if not isinstance(parts, Mapping) or not parts:
+        got = "none" if isinstance(parts, Mapping) else type(parts).__name__
+        raise UsageError(f"reward {plugins.name_of(reward)}: expected parts by name, as {{'new': …}}, got {got}")
+    agents = len(facts.coverage)
+    return {name: _for_each(agents, value, reward, name) for name, value in parts.items()}
 
 
-def _for_each(agents: int, value: Number | float, what: str) -> NDArray[np.float64]:
+def _for_each(agents: int, value: Number | float, reward: RewardFunction, part: str) -> NDArray[np.float64]:
     try:
         numbers = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise UsageError(f"reward {what}: expected numbers, got {value!r}") from None
+        raise _wrong_part(reward, part, "numbers", repr(value)) from None
     if not np.isfinite(numbers).all():
-        raise UsageError(f"reward {what}: expected finite numbers, got {value!r}")
+        raise _wrong_part(reward, part, "finite numbers", repr(value))
     if numbers.shape not in ((), (agents,)):
-        raise UsageError(f"reward {what}: expected one number for each of {agents} agents, got shape {numbers.shape}")
+        raise _wrong_part(reward, part, f"one number for each of {agents} agents", f"shape {numbers.shape}")
     return np.full(agents, numbers) if numbers.ndim == 0 else numbers
+
+
+def _wrong_part(reward: RewardFunction, part: str, expected: str, got: str) -> UsageError:
+    words = " ".join(got.split())
+    return UsageError(f"reward {plugins.name_of(reward)}: part {part!r}: expected {expected}, got {words}")

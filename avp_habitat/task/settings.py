@@ -1,25 +1,35 @@
 """The settings of the task, with the design's defaults."""
 
-from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from dataclasses import asdict, dataclass, field, fields
+from typing import Annotated, Any, Literal
 
+from avp_habitat import plugins
 from avp_habitat.errors import UsageError
+from avp_habitat.metrics import find_metrics
 from avp_habitat.poses import Intrinsics
 from avp_habitat.ranges import Range, hold_ranges
-from avp_habitat.task.rewards import RewardConstants, check_reward
+from avp_habitat.task.rewards import RewardConstants, RewardFunction, find_reward, needs_surface
 
 ACTION_NAMES = ("move_forward", "turn_left", "turn_right", "look_up", "look_down", "stop")
 MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, LOOK_UP, LOOK_DOWN, STOP = range(len(ACTION_NAMES))
 COVERAGE_MODES = ("visible", "over")
-OBSERVATION_NAMES = ("numbers", "map", "surface_map")
+OBSERVATIONS = {
+    "numbers": "avp_habitat.task.observations:Numbers",
+    "map": "avp_habitat.task.observations:Map",
+    "surface_map": "avp_habitat.task.observations:SurfaceMap",
+}
+"""The kinds that are built in, by name."""
+OBSERVATIONS_HELP = f"{', '.join(OBSERVATIONS)} or MODULE:OBJECT"
+"""Help of the option `--observation`."""
 
 
 @dataclass(frozen=True)
 class TaskSettings:
     """Everything about the task but the scene."""
 
-    reward: str = "proposed"
-    """Name of the reward: coverage, coverage_redundancy, proposed or surface."""
+    reward: str | RewardFunction = "proposed"
+    """The reward: coverage, coverage_redundancy, proposed, surface, `module:function`, another distribution's, or the
+    function itself (`rewards.RewardFunction`)."""
     constants: RewardConstants = field(default_factory=RewardConstants)
     """The rewards' constants."""
     budget: Annotated[int, Range(1, 32767)] = 80
@@ -48,16 +58,25 @@ class TaskSettings:
     """A hit this close before a floor point still observes it, metres along the ray."""
     coverage_mode: Literal["visible", "over"] = "visible"
     """visible: a cell's floor point is seen. over: a camera ray passes over the cell."""
-    observation: Literal["numbers", "map", "surface_map"] = "numbers"
+    observation: Any = "numbers"
     """numbers: the twelve of the design. map: these, whether C ≥ τ, and a map of what was seen of the floor around the
-    agent. surface_map: these, and maps of what was seen of walls, furniture and ceiling."""
+    agent. surface_map: these, and maps of what was seen of walls, furniture and ceiling. Or `module:object`, another
+    distribution's, or the object itself (`observations.Observation`)."""
+    metrics: tuple[Any, ...] = ()
+    """Further metrics, of episodes and of rollouts: `module:function`, another distribution's, or the functions
+    themselves (`metrics.metric`). Their values stand beside the suite's own wherever these are logged."""
     lookup: bool = False
     """Whether views are looked up in tables of the scene instead of casting all their rays: faster, for training."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot work, by the option's name."""
-        check_reward(self.reward)
+        find_reward(self.reward)
+        if self.observation not in OBSERVATIONS:  # Those are imported by who makes one.
+            plugins.find("avp.observations", self.observation, OBSERVATIONS)
         hold_ranges(self)
+        metrics = (self.metrics,) if isinstance(self.metrics, str) else tuple(self.metrics)
+        object.__setattr__(self, "metrics", metrics)
+        find_metrics(metrics)
         if self.collision_m >= self.forward_m:
             raise UsageError(
                 f"collision_m: expected less than forward_m ({self.forward_m:g}), or every move is a collision, got "
@@ -67,7 +86,16 @@ class TaskSettings:
     @property
     def with_surface(self) -> bool:
         """Whether what was seen of the scene's surface is computed: the reward or the observation needs it."""
-        return self.reward == "surface" or self.observation == "surface_map"
+        kind = plugins.find("avp.observations", self.observation, OBSERVATIONS)
+        return needs_surface(find_reward(self.reward)) or needs_surface(kind)
+
+    def facts(self) -> dict[str, Any]:
+        """All fields as they are stored as text: objects by their names."""
+        named = {"reward": plugins.name_of(self.reward), "observation": plugins.name_of(self.observation)}
+        plain = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "metrics"}
+        if self.metrics:
+            named["metrics"] = ", ".join(map(plugins.name_of, self.metrics))
+        return plain | {"constants": asdict(self.constants)} | named
 
     @property
     def intrinsics(self) -> Intrinsics:

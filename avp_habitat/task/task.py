@@ -6,22 +6,24 @@ together. Every step of an agent captures one view, also a step that does not mo
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat import poses
 from avp_habitat.simulators.base import Simulator
-from avp_habitat.surface.map import SIZE as SURFACE_MAP_SIZE
-from avp_habitat.surface.memory import RoomSurface, room_surfaces
+from avp_habitat.surface.memory import RoomSurface
 from avp_habitat.task import motion
 from avp_habitat.task.agent_view import AgentView
-from avp_habitat.task.observations import SIZE as MAP_SIZE
-from avp_habitat.task.observations import MapObserver, observation
-from avp_habitat.task.perception import Perception, Senses, Views, make_senses
-from avp_habitat.task.rewards import StepFacts, has_stop, reward_parts, stops_episode
+from avp_habitat.task.cast import CastSensor
+from avp_habitat.task.floor_map import MapObserver
+from avp_habitat.task.lookup import TableSensor
+from avp_habitat.task.observations import Agents, Observed, SceneAgents, make_observation
+from avp_habitat.task.rewards import StepFacts, find_reward, has_stop, reward_parts, stops_episode
 from avp_habitat.task.settings import MOVE_FORWARD, STOP, TaskSettings
 from avp_habitat.task.trajectory import Trajectory
+from avp_habitat.task.views import Sensor, Shown, Views, centre_depth
 
 Float = NDArray[np.floating]
 Rows = NDArray[np.int64]
@@ -31,8 +33,8 @@ Rows = NDArray[np.int64]
 class StepOutcome:
     """What one step of n agents gave; every array's first axis is n."""
 
-    observation: NDArray[np.float32]
-    """`(n, 12)`, or longer with a map."""
+    observation: Observed
+    """As the settings' kind of observation says."""
     reward: NDArray[np.float64]
     """`(n,)` sum of the parts."""
     parts: dict[str, NDArray[np.float64]]
@@ -50,11 +52,10 @@ class _Room:
     """One scene and the agents in it."""
 
     simulator: Simulator
-    senses: Senses
-    maps: MapObserver
-    cells: int
-    rows: Rows
+    sensor: Sensor
+    floor: MapObserver
     surface: RoomSurface | None
+    rows: Rows
 
 
 class ViewpointTask:
@@ -74,24 +75,15 @@ class ViewpointTask:
         scenes = list(simulators) if isinstance(simulators, Sequence) else [simulators]
         self.settings = settings
         self.agents = agents
+        self._reward = find_reward(settings.reward)
+        self.kind = make_observation(settings)
+        """The kind of observation; its `space` is of one agent."""
         self._everyone = np.arange(agents)
         self._room_of = self._everyone % len(scenes)
-        scenes = scenes[:agents]
-        surfaces = room_surfaces(scenes, settings, self._room_of)
-        self._rooms = [
-            _Room(
-                scene,
-                make_senses(scene, settings),
-                MapObserver(scene.area),
-                len(scene.area.centres),
-                np.flatnonzero(self._room_of == index),
-                surface,
-            )
-            for index, (scene, surface) in enumerate(zip(scenes, surfaces, strict=True))
-        ]
-        self._cells = np.array([self._rooms[index].cells for index in self._room_of])
-        self._diameter = np.array([self._rooms[index].simulator.area.diameter_m for index in self._room_of])
-        budget = settings.budget
+        self._rooms = [self._room(scene, index) for index, scene in enumerate(scenes[:agents])]
+        areas = [self._rooms[index].simulator.area for index in self._room_of]
+        self._cells = np.array([len(area.centres) for area in areas])
+        self._diameter = np.array([area.diameter_m for area in areas])
         self.steps = np.zeros(agents, dtype=np.int64)
         self.position = np.zeros((agents, 3))
         self.yaw = np.zeros(agents)
@@ -100,14 +92,19 @@ class ViewpointTask:
         self._observed = np.zeros(agents, dtype=np.int64)
         self._collided = np.zeros(agents, dtype=np.bool_)
         # Row 0 is the start, row t the state after step t.
-        self._path = np.zeros((agents, budget + 1, 3))
-        self._angles = np.zeros((agents, budget + 1, 2))
-        self._cell = np.zeros((agents, budget + 1, 2), dtype=np.int64)
-        self._log = {
-            name: np.zeros((agents, budget)) for name in ("action", "reward", "coverage", "collided", "redundant")
-        }
+        self._path = np.zeros((agents, settings.budget + 1, 3))
+        self._angles = np.zeros((agents, settings.budget + 1, 2))
+        self._cell = np.zeros((agents, settings.budget + 1, 2), dtype=np.int64)
+        logged = ("action", "reward", "coverage", "collided", "redundant")
+        self._log = {name: np.zeros((agents, settings.budget)) for name in logged}
         # By the names that the reward gives them, from the first step that has them; zero in all others.
         self._parts: dict[str, NDArray[np.float64]] = {}
+
+    def _room(self, scene: Simulator, index: int) -> _Room:
+        settings, rows = self.settings, np.flatnonzero(self._room_of == index)
+        sensor = TableSensor(scene, settings) if settings.lookup else CastSensor(scene, settings)
+        surface = RoomSurface(scene, settings, self.agents, rows) if settings.with_surface else None
+        return _Room(scene, sensor, MapObserver(scene.area), surface, rows)
 
     def simulator(self, row: int) -> Simulator:
         """The simulator of one agent's scene."""
@@ -127,8 +124,7 @@ class ViewpointTask:
 
     def centre_depth(self, row: int) -> float:
         """Planar depth in metres in the middle of an agent's newest view, the whole range where nothing is hit."""
-        rows = np.array([row])
-        return float(self._rooms[self._room_of[row]].senses.centre_depth(self._views(rows))[0])
+        return float(centre_depth(self.simulator(row), self.settings, self._views(np.array([row])))[0])
 
     @property
     def coverage(self) -> NDArray[np.float64]:
@@ -140,7 +136,7 @@ class ViewpointTask:
         """`(n, 4, 4)` the sensors' poses now, habitat axes."""
         return motion.sensor_poses(self.settings, self.position, self.yaw, self.pitch)
 
-    def reset(self, rows: Sequence[int] | NDArray[np.integer], position: Float, yaw: Float) -> NDArray[np.float32]:
+    def reset(self, rows: Sequence[int] | NDArray[np.integer], position: Float, yaw: Float) -> Observed:
         """Start new episodes of some agents, looking straight ahead.
 
         Args:
@@ -149,7 +145,7 @@ class ViewpointTask:
             yaw: `(len(rows),)` radians.
 
         Returns:
-            `(len(rows), 12)` first observations, longer with a map; their views are not captured and observe nothing.
+            The first observations of these agents; their views are not captured and observe nothing.
         """
         rows = np.asarray(rows, dtype=np.int64)
         self.position[rows], self.yaw[rows], self.pitch[rows] = position, poses.wrap_angle(yaw), 0.0
@@ -157,11 +153,11 @@ class ViewpointTask:
         self._remember(rows)
         least, mean = np.empty((2, len(rows)))
         for room, chosen in self._by_room(rows):
-            seen = room.senses.look(self._views(rows[chosen]))
+            seen = room.sensor.look(self._views(rows[chosen]))
             least[chosen], mean[chosen] = seen.least, seen.mean
             if room.surface is not None:
                 room.surface.reset(rows[chosen])
-        return self._observe(rows, Perception(least, mean, np.zeros(len(rows), dtype=np.int64)), np.zeros(len(rows)))
+        return self._observe(rows, Shown(least, mean, np.zeros(len(rows), dtype=np.int64)), np.zeros(len(rows)))
 
     def step(self, actions: NDArray[np.integer]) -> StepOutcome:
         """Advance every agent by one action and one captured view.
@@ -176,7 +172,7 @@ class ViewpointTask:
         seen = self._capture()
         self._observed += seen.new_cells
         facts = self._facts(actions, seen.new_cells, self._capture_surface())
-        parts = reward_parts(self.settings.reward, facts, self.settings.constants)
+        parts = reward_parts(self._reward, facts, self.settings.constants)
         reward = np.sum(list(parts.values()), axis=0) + np.zeros(self.agents)
         terminated = stops_episode(facts, self.settings.constants)
         self._record(actions, reward, parts, facts)
@@ -260,15 +256,15 @@ class ViewpointTask:
             self.position[rows] = after
         return collided
 
-    def _capture(self) -> Perception:
+    def _capture(self) -> Shown:
         """What the newest views of all agents show; their new cells are marked."""
         if len(self._rooms) == 1:
             room = self._rooms[0]
-            return room.senses.capture(self._views(room.rows), self._first_seen, room.rows, self.steps)
-        whole = Perception(np.empty(self.agents), np.empty(self.agents), np.empty(self.agents, dtype=np.int64))
+            return room.sensor.capture(self._views(room.rows), self._first_seen, room.rows, self.steps)
+        whole = Shown(np.empty(self.agents), np.empty(self.agents), np.empty(self.agents, dtype=np.int64))
         for room in self._rooms:
-            part = room.senses.capture(self._views(room.rows), self._first_seen, room.rows, self.steps[room.rows])
-            for column in fields(Perception):
+            part = room.sensor.capture(self._views(room.rows), self._first_seen, room.rows, self.steps[room.rows])
+            for column in fields(Shown):
                 getattr(whole, column.name)[room.rows] = getattr(part, column.name)
         return whole
 
@@ -281,10 +277,8 @@ class ViewpointTask:
         return gain
 
     def _facts(self, actions: NDArray[np.integer], new_cells: NDArray[np.integer], new_surface: Float) -> StepFacts:
-        from avp_habitat.task.motion import history
-
         constants = self.settings.constants
-        past = history(
+        past = motion.history(
             self._path,
             self._angles,
             self._cell,
@@ -299,41 +293,42 @@ class ViewpointTask:
             spread_m=past.spread_m,
             collided=self._collided,
             redundant=past.redundant,
-            stop_chosen=(actions == STOP) & has_stop(self.settings.reward),
+            stop_chosen=(actions == STOP) & has_stop(self._reward),
             coverage=self.coverage,
             steps_left=self.settings.budget - self.steps,
         )
 
-    def _observe(self, rows: Rows, seen: Perception, spread_m: NDArray[np.number]) -> NDArray[np.float32]:
-        radius = self._diameter[rows]
-        numbers = observation(
-            progress=self.steps[rows] / self.settings.budget,
-            offset=(self.position[rows] - self._path[rows, 0])[:, [0, 2]] / radius[:, None],
+    def _observe(self, rows: Rows, seen: Shown, spread_m: NDArray[np.number]) -> Observed:
+        agents = Agents(
+            settings=self.settings,
+            steps=self.steps[rows],
+            start=self._path[rows, 0],
+            position=self.position[rows],
             yaw=self.yaw[rows],
             pitch=self.pitch[rows],
             min_depth=seen.least,
             mean_depth=seen.mean,
             coverage=self.coverage[rows],
             collided=self._collided[rows],
-            spread=np.asarray(spread_m, dtype=np.float64) / radius,
+            spread_m=np.asarray(spread_m, dtype=np.float64),
+            diameter_m=self._diameter[rows],
+            _by_scene=partial(self._scenes, rows),
         )
-        if self.settings.observation == "numbers":
-            return numbers
-        return np.concatenate([numbers, self._maps(rows)], axis=1)
+        return self.kind(agents)
 
-    def _maps(self, rows: Rows) -> NDArray[np.float32]:
-        """`(len(rows), 1 + …)` whether C ≥ τ, the map of the floor, and those of the surface when asked for."""
-        with_surface = self.settings.observation == "surface_map"
-        floor = 1 + MAP_SIZE
-        maps = np.empty((len(rows), floor + with_surface * SURFACE_MAP_SIZE), dtype=np.float32)
-        maps[:, 0] = self.coverage[rows] >= self.settings.constants.stop_coverage
-        for room, chosen in self._by_room(rows):
-            at = rows[chosen]
-            maps[chosen, 1:floor] = room.maps.observe(self._first_seen, at, self.position[at], self.yaw[at])
-            if with_surface:
-                assert room.surface is not None
-                maps[chosen, floor:] = room.surface.observe(at, self.position[at], self.yaw[at])
-        return maps
+    def _scenes(self, rows: Rows) -> list[SceneAgents]:
+        return [
+            SceneAgents(
+                simulator=room.simulator,
+                chosen=chosen,
+                views=self._views(rows[chosen]),
+                _rows=rows[chosen],
+                _first_seen=self._first_seen,
+                _floor=room.floor,
+                _surface=room.surface,
+            )
+            for room, chosen in self._by_room(rows)
+        ]
 
     def _record(
         self, actions: NDArray[np.integer], reward: Float, parts: dict[str, NDArray[np.float64]], facts: StepFacts

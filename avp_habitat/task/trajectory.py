@@ -1,6 +1,8 @@
 """What one agent did in one episode, as arrays over its steps and as figures."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,16 +42,17 @@ class Trajectory:
     """How well the scene's surface was seen at the end, within [0, 1] (`surfaces`); None where it was not computed."""
 
 
-def episode_metrics(trajectory: Trajectory, *, stopped: bool) -> dict[str, float]:
+def episode_metrics(trajectory: Trajectory, *, stopped: bool, further: Sequence[Any] = ()) -> dict[str, float]:
     """Figures of one finished episode, by the keys of `info["avp_episode"]`.
 
     Args:
         trajectory: of the whole episode.
         stopped: whether the agent ended it with enough coverage.
+        further: metrics of the user, as `TaskSettings.metrics`.
 
     Returns:
         coverage, views, annd_m, ei, path_length_m, collisions, redundant_views, stopped, `return_PART` for each part of
-        the reward, and surface where it was computed.
+        the reward, surface where it was computed, and those of the further metrics.
     """
     surface = {} if trajectory.surface is None else {"surface": trajectory.surface}
     views = len(trajectory.action)
@@ -65,4 +68,5 @@ def episode_metrics(trajectory: Trajectory, *, stopped: bool) -> dict[str, float
         "stopped": float(stopped),
         **{f"return_{name}": float(values.sum()) for name, values in trajectory.reward_parts.items()},
         **surface,
+        **metrics.measured(further, "episode", trajectory),
     }

@@ -1,10 +1,11 @@
-"""Where a frame would rather be, judged by the depth of other frames: point-to-plane ICP with Open3D."""
+"""What Open3D does with the frames' points: the fused cloud, their distance to the mesh, and point-to-plane ICP."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from avp_habitat.poses import Intrinsics, pixel_directions
 from avp_habitat.rollout.format import Rollout
@@ -240,30 +241,12 @@ def _fixed_part(pose: Float, motion: Float, points: Float, normals: Float) -> Co
     rows = np.concatenate([np.cross(points, normals) / radius, normals], axis=1)
     stiffness, directions = np.linalg.eigh(rows.T @ rows / len(rows))
     fixed = directions[:, stiffness > _LEAST_STIFFNESS]
-    turn = rotation_vector(motion[:3, :3])
+    turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
     twist = np.concatenate([turn * radius, motion[:3, 3]])
     twist = fixed @ (fixed.T @ twist)
-    rotation = rotation_matrix(twist[:3] / radius)
+    rotation = Rotation.from_rotvec(twist[:3] / radius).as_matrix()
     corrected = pose.copy()
     corrected[:3, :3] = rotation @ pose[:3, :3]
     corrected[:3, 3] = pose[:3, 3] + twist[3:]
     angle = float(np.degrees(np.linalg.norm(twist[:3] / radius)))
     return Correction(twist[3:], angle, corrected, fixed.shape[1])
-
-
-def rotation_vector(rotation: Float) -> Float:
-    """Axis times angle in radians, `(3,)`, of a `(3, 3)` rotation by less than half a turn."""
-    axis = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
-    sine = float(np.linalg.norm(axis)) / 2
-    angle = float(np.arctan2(sine, (np.trace(rotation) - 1) / 2))
-    return axis / 2 if sine < 1e-12 else axis / (2 * sine) * angle
-
-
-def rotation_matrix(vector: Float) -> Float:
-    """The `(3, 3)` rotation of axis times angle in radians (Rodrigues' formula)."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross

@@ -1,4 +1,4 @@
-"""Exporting a rollout as a COLMAP model."""
+"""Rollouts as COLMAP models, and COLMAP's triangulation."""
 
 import os
 import shutil
@@ -10,10 +10,15 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from avp_habitat.errors import RolloutError, UsageError
+from avp_habitat.errors import RolloutError
+from avp_habitat.files import atomic_folder
 from avp_habitat.poses import Intrinsics, habitat_to_opencv
 from avp_habitat.rollout.format import Rollout
 from avp_nerfstudio.check.pictures.matching import Matches, match_pictures, quiet_colmap
+
+IMAGES = "images"
+# Where nerfstudio's `colmap` parser looks by default.
+SPARSE = Path("colmap") / "sparse" / "0"
 
 
 def colmap_camera(intrinsics: Intrinsics) -> pycolmap.Camera:
@@ -95,11 +100,6 @@ def _write_database(path: Path, matches: Matches, model: pycolmap.Reconstruction
         database.close()
 
 
-IMAGES = "images"
-# Where nerfstudio's `colmap` parser looks by default.
-SPARSE = Path("colmap") / "sparse" / "0"
-
-
 def export_colmap(
     rollout: Rollout,
     folder: str | Path,
@@ -132,21 +132,12 @@ def export_colmap(
         UsageError: the folder exists.
         RolloutError: a picture cannot be read, or the folder cannot be written.
     """
-    folder = Path(folder)
-    if folder.exists() or folder.is_symlink():
-        raise UsageError(f"{folder}: exists already, expected a new folder for the COLMAP model")
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.partial-") as scratch:
-            partial = Path(scratch) / folder.name
-            _write_images(rollout, partial / IMAGES)
-            if points and matches is None:
-                matches = match_pictures(rollout, workdir=Path(scratch), progress=progress)
-            _write_model(rollout, partial / SPARSE, matches if points else None)
-            partial.rename(folder)
-    except OSError as error:
-        raise RolloutError(f"{folder}: could not write the COLMAP model: {error.strerror or error}") from error
-    return folder
+    with atomic_folder(folder, failure=RolloutError) as partial:
+        _write_images(rollout, partial / IMAGES)
+        if points and matches is None:
+            matches = match_pictures(rollout, progress=progress)
+        _write_model(rollout, partial / SPARSE, matches if points else None)
+    return Path(folder)
 
 
 def _write_images(rollout: Rollout, folder: Path) -> None:

@@ -89,7 +89,8 @@ def swapped_intrinsics(given: Cameras) -> Iterator[Hypothesis]:
     exchanged = replace(k, fx=k.fy, fy=k.fx, cx=k.cy, cy=k.cx)
     from_height = k.fx * k.width / k.height
     cause = "width and height look swapped in the intrinsics: cx and cy belong to a picture of {}x{}"
-    for intrinsics in (exchanged, replace(exchanged, fx=from_height, fy=from_height)):
+    from_width = replace(k, fx=from_height, fy=from_height)
+    for intrinsics in (exchanged, replace(exchanged, fx=from_height, fy=from_height), from_width):
         yield Hypothesis("swapped", cause.format(k.height, k.width), replace(given, intrinsics=intrinsics))
 
 

@@ -3,7 +3,6 @@
 import io
 import json
 import math
-import os
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -16,12 +15,18 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from avp_habitat.errors import RolloutError, UsageError
+from avp_habitat.files import atomic_file
 from avp_habitat.provenance import installed_versions
 from avp_habitat.rollout.format import Rollout
-from avp_nerfstudio.check.cloud import Cloud, frusta, frustum_colours
+from avp_nerfstudio.check.cloud import Cloud, frusta, frustum_colours, fuse, write_ply
 from avp_nerfstudio.check.hypotheses import Cameras
 from avp_nerfstudio.check.verdict import Verdict
 
+FORMAT = "avp-check"
+REPORT, PICTURE, CLOUD, RECORDING = "check.json", "overview.png", "cloud.ply", "check.rrd"
+_VERSIONED = ("avp-suite", "numpy", "open3d", "pycolmap", "rerun-sdk", "matplotlib")
+_PICTURES = 200
+_PICTURE_WIDTH = 320
 _ABOVE_CAMERAS_M = 0.3
 _MOST_POINTS = 150_000
 _OUTLIERS = 0.5
@@ -88,11 +93,6 @@ def _limit(axes, points: NDArray[np.floating], across: int, along: int) -> None:
         setter(limits[::-1] if axis == 2 else limits)
 
 
-_APPLICATION = "avp-check"
-_PICTURES = 200
-_PICTURE_WIDTH = 320
-
-
 def write_recording(path: Path, rollout: Rollout, cloud: Cloud, cameras: Cameras, bad: NDArray[np.bool_]) -> None:
     """Write an `.rrd` file.
 
@@ -110,7 +110,7 @@ def write_recording(path: Path, rollout: Rollout, cloud: Cloud, cameras: Cameras
         OSError: it cannot be written.
     """
     path.touch()  # Rerun's own error for an unwritable path has neither the path nor an errno.
-    recording = rr.RecordingStream(_APPLICATION)
+    recording = rr.RecordingStream(FORMAT)
     recording.save(path, default_blueprint=_blueprint())
     try:
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
@@ -155,11 +155,6 @@ def _blueprint() -> rrb.Blueprint:
     )
 
 
-FORMAT = "avp-check"
-REPORT, PICTURE, CLOUD, RECORDING = "check.json", "overview.png", "cloud.ply", "check.rrd"
-_VERSIONED = ("avp-suite", "numpy", "open3d", "pycolmap", "rerun-sdk", "matplotlib")
-
-
 def choose_folder(rollout: Path, out: Path | None) -> Path:
     """Where the results go: `ROLLOUT-check` beside the rollout by default.
 
@@ -199,25 +194,13 @@ def write_outputs(
         RolloutError: the folder cannot be written.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name in (PICTURE, CLOUD, RECORDING):
-            if name in files:
-                _publish(folder / name, files[name])
-            else:
-                (folder / name).unlink(missing_ok=True)
-        _publish(folder / REPORT, lambda path: _write_report(path, rollout, verdicts))
+        for name in {PICTURE, CLOUD, RECORDING} - files.keys():
+            (folder / name).unlink(missing_ok=True)
+        for name, write in (files | {REPORT: lambda path: _write_report(path, rollout, verdicts)}).items():
+            with atomic_file(folder / name) as partial:
+                write(partial)
     except OSError as error:
         raise RolloutError(f"--out {folder}: cannot write there: {error.strerror or error}") from None
-
-
-def _publish(path: Path, write: Callable[[Path], None]) -> None:
-    # The suffix stays the last part of the name: libraries choose the format by it.
-    temporary = path.with_name(f".partial-{os.getpid()}-{path.name}")
-    try:
-        write(temporary)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _write_report(path: Path, rollout: Path, verdicts: list[Verdict]) -> None:
@@ -241,11 +224,6 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
 
 def outputs_of_geometry(rollout: Rollout, geometry: Any, verdicts: list[Verdict]) -> dict[str, Callable[[Path], None]]:
     """What writes the picture, the cloud and the recording of a `Geometry`."""
-    from avp_nerfstudio.check.cloud import fuse, write_ply
-
-    pass
-    pass
-
     cameras, bad = geometry.cameras, geometry.bad
     cloud = fuse(rollout, geometry.maps, cameras, bad)
     return {

@@ -3,9 +3,9 @@
 import functools
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, get_args
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -15,15 +15,26 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.scene_box import SceneBox
 from numpy.typing import NDArray
 
-from avp_habitat.errors import AVPError, RolloutError
-from avp_habitat.poses import Intrinsics, y_up_to_z_up
+from avp_habitat.errors import AVPError, RolloutError, UsageError
+from avp_habitat.poses import y_up_to_z_up
+from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.format import Rollout, View, name_of
 from avp_habitat.rollout.images import DEPTH_UNIT_M, read_depth
-from avp_nerfstudio.data.foreign import check_is_rollout
-from avp_nerfstudio.data.frames import Order, chosen_views, read_merged
-from avp_nerfstudio.data.seen_points import SeenPoints, scene_box, seen_points, subset
-from avp_nerfstudio.data.verification import verify_pictures
-from avp_nerfstudio.method.running import check_device, check_is_there, discard_outputs
+from avp_nerfstudio.data.frames import (
+    Order,
+    SeenPoints,
+    chosen_views,
+    read_merged,
+    scene_box,
+    seen_points,
+    subset,
+    verify_pictures,
+)
+from avp_nerfstudio.data.refusals import UnusableRolloutError, check_device, check_is_rollout, discard_outputs
+
+SPLITS = ("train", "val", "test")
+METRES_TO_SCENE = "metres_to_scene"
+"""In the metadata of all splits: units of the scene per metre, for methods whose options are in metres."""
 
 
 class RGBDDataset(InputDataset):
@@ -43,24 +54,6 @@ class RGBDDataset(InputDataset):
         return {"depth_image": depth[..., None] * self._dataparser_outputs.dataparser_scale}
 
 
-SPLITS = ("train", "val", "test")
-METRES_TO_SCENE = "metres_to_scene"
-"""In the metadata of all splits: units of the scene per metre, for methods whose options are in metres."""
-
-
-class UnusableRolloutError(RolloutError, SystemExit):
-    """A rollout that nerfstudio cannot use.
-
-    An ordinary `RolloutError` to whoever catches it; where nobody does (in `ns-train`, `ns-eval`, ...) the
-    interpreter ends as on `sys.exit(text)`: the text on one line, exit code 1 and no traceback.
-    """
-
-    def __init__(self, text: str) -> None:
-        """Remember the text as the interpreter's last words."""
-        super().__init__(text)
-        self.code = f"error: {text}"
-
-
 @dataclass
 class AVPDataParserConfig(DataParserConfig):
     """Options of `avp-data`; without any, poses are those of the rollout, in metres, Z up."""
@@ -72,12 +65,12 @@ class AVPDataParserConfig(DataParserConfig):
     also: tuple[Path, ...] = ()
     """More rollouts of the same scene and camera, whose frames are trained with too. The held-out views are those of
     --data: they follow from the scene, so all hold the same."""
-    scale: float = 1.0
+    scale: Annotated[float, Range(1e-6, 10**6)] = 1.0
     """Multiplies all positions, depths and the scene box; 1 keeps metres. It is written to
     dataparser_transforms.json, so that nerfstudio's exports and poses can be brought back to metres."""
-    every: int = 1
+    every: Annotated[int, Range(1, 10**6)] = 1
     """Train with every n-th captured frame only."""
-    max_views: int = 0
+    max_views: Annotated[int, Range(0, 10**6)] = 0
     """Train with the first n of these frames only; 0 for all."""
     order: Order = "steps"
     """Which frames --max-views takes first: `steps` as they were captured (of several rollouts one after another);
@@ -86,10 +79,10 @@ class AVPDataParserConfig(DataParserConfig):
     """Give the rollout's depth to methods that use it (depth-nerfacto, avp-nerfacto, splatfacto's initial points).
     False makes the reconstruction one from colours alone; only the scene box still comes from depth. The depth is
     along the camera's axis, not along the ray: leave depth-nerfacto's is_euclidean_depth at False."""
-    initial_points: int = 50_000
+    initial_points: Annotated[int, Range(0, 10**8)] = 50_000
     """Give splatfacto at most so many coloured points to begin with, from the depth of at most 24 of the frames; 0
     for none. Other methods ignore them."""
-    box_margin_m: float = 0.1
+    box_margin_m: Annotated[float, Range(0, 10**6)] = 0.1
     """The scene box is the box around the frames' cameras and what their depth shows (without the farthest 0.2 % on
     each side; a rollout says how large the navigable area is, not where it lies), and so many metres more on every
     side."""
@@ -97,18 +90,6 @@ class AVPDataParserConfig(DataParserConfig):
     """Decode every picture before training, each byte held to its checksum; None does so when they have at most
     256 MiB (100 views of 640x480 take about a second). That every picture is there, whole and of the right size is
     always checked."""
-
-
-@dataclass(frozen=True)
-class _Parsed:
-    """What all splits of one parser share."""
-
-    rollout: Rollout
-    """As read, with the frames of those merged into it."""
-    frames: list[View]
-    """To train with."""
-    seen: SeenPoints
-    """By these frames; in metres."""
 
 
 @dataclass
@@ -126,18 +107,23 @@ class AVPDataParser(DataParser):
             raise UnusableRolloutError(str(error)) from None
 
     @functools.cached_property
-    def _parsed(self) -> _Parsed:
+    def _parsed(self) -> tuple[Rollout, list[View], SeenPoints]:
+        """The rollout with the frames of those merged into it, the frames to train with, and the points they saw."""
         config = self.config
-        _check_options(config)
+        if config.data == Path():
+            raise RolloutError("avp-data: no rollout named; add --data with a rollout's folder")
+        try:
+            hold_ranges(config)
+        except UsageError as error:
+            raise RolloutError(f"avp-data: {error}") from None
         for path in (config.data, *config.also):
-            check_is_there(path)
             check_is_rollout(path)
         rollout = read_merged(config.data, config.also)
         frames = chosen_views(rollout.frames, every=config.every, max_views=config.max_views, order=config.order)
         if not frames:
             raise RolloutError(f"{rollout.folder}: expected at least one captured frame, found none")
         verify_pictures([*frames, *rollout.heldout], wanted=config.verify)
-        return _Parsed(rollout, frames, seen_points(frames, rollout.intrinsics, colours=self._gives_points))
+        return rollout, frames, seen_points(frames, rollout.intrinsics, colours=self._gives_points)
 
     @property
     def _gives_points(self) -> bool:
@@ -146,20 +132,29 @@ class AVPDataParser(DataParser):
     def _outputs(self, split: str) -> DataparserOutputs:
         if split not in SPLITS:
             raise RolloutError(f"avp-data: unknown split {split!r}: expected one of {', '.join(SPLITS)}")
-        parsed, scale = self._parsed, self.config.scale
-        views = parsed.frames if split == "train" else parsed.rollout.heldout
+        (rollout, frames, seen), scale = self._parsed, self.config.scale
+        views = frames if split == "train" else rollout.heldout
         if not views:
-            raise RolloutError(_no_heldout_views(parsed.rollout, split))
+            raise RolloutError(_no_heldout_views(rollout, split))
         poses = nerfstudio_poses([view.camera_to_world for view in views], scale=scale)
-        box = scene_box(parsed.frames, parsed.seen, margin_m=self.config.box_margin_m) * scale
+        box = scene_box(frames, seen, margin_m=self.config.box_margin_m) * scale
         metadata: dict[str, Any] = {METRES_TO_SCENE: scale}
         if self.config.depth:
-            metadata |= _depth_metadata(views)
-        if split == "train" and self._gives_points:
-            metadata |= _point_metadata(subset(parsed.seen, self.config.initial_points), scale)
+            metadata["depth_filenames"] = [view.depth for view in views]
+            # nerfstudio multiplies it by dataparser_scale itself, where it reads depth.
+            metadata["depth_unit_scale_factor"] = DEPTH_UNIT_M
+        if split == "train" and self._gives_points and len(seen.xyz):
+            points = subset(seen, self.config.initial_points)
+            metadata["points3D_xyz"] = torch.from_numpy(points.xyz * np.float32(scale))
+            metadata["points3D_rgb"] = torch.from_numpy(points.rgb)
         return DataparserOutputs(
             image_filenames=[view.image for view in views],
-            cameras=_cameras(poses, parsed.rollout.intrinsics),
+            cameras=Cameras(
+                camera_to_worlds=torch.from_numpy(poses),
+                **asdict(rollout.intrinsics),
+                camera_type=CameraType.PERSPECTIVE,
+                metadata={},  # `ns-export cameras` asserts that there is some
+            ),
             scene_box=SceneBox(aabb=torch.from_numpy(box.astype(np.float32))),
             metadata=metadata,
             dataparser_transform=torch.from_numpy(y_up_to_z_up(np.eye(4))[:3].astype(np.float32)),
@@ -182,38 +177,6 @@ def nerfstudio_poses(poses: Sequence[NDArray[np.floating]], *, scale: float) -> 
     return turned.astype(np.float32)
 
 
-def _depth_metadata(views: Sequence[View]) -> dict[str, Any]:
-    return {
-        "depth_filenames": [view.depth for view in views],
-        # nerfstudio multiplies it by dataparser_scale itself, where it reads depth.
-        "depth_unit_scale_factor": DEPTH_UNIT_M,
-    }
-
-
-def _point_metadata(points: SeenPoints, scale: float) -> dict[str, Any]:
-    """As nerfstudio's pipeline looks for them; a method that cannot use them is not given any."""
-    if not len(points.xyz):
-        return {}
-    return {
-        "points3D_xyz": torch.from_numpy(points.xyz * np.float32(scale)),
-        "points3D_rgb": torch.from_numpy(points.rgb),
-    }
-
-
-def _cameras(poses: NDArray[np.float32], intrinsics: Intrinsics) -> Cameras:
-    return Cameras(
-        camera_to_worlds=torch.from_numpy(poses),
-        fx=intrinsics.fx,
-        fy=intrinsics.fy,
-        cx=intrinsics.cx,
-        cy=intrinsics.cy,
-        width=intrinsics.width,
-        height=intrinsics.height,
-        camera_type=CameraType.PERSPECTIVE,
-        metadata={},  # `ns-export cameras` asserts that there is some
-    )
-
-
 def _no_heldout_views(rollout: Rollout, split: str) -> str:
     scene = shlex.quote(name_of(rollout.meta, "scene") or "SCENE")
     again = f"python -m avp_habitat.collect --scene {scene} --policy POLICY --out NEW_FOLDER"
@@ -221,22 +184,3 @@ def _no_heldout_views(rollout: Rollout, split: str) -> str:
         f"{rollout.folder}: expected held-out views for the {split} split, found none; they are captured with the "
         f"rollout and no command adds them to a folder: collect it again with `{again}`, which captures 20 of them"
     )
-
-
-def _check_options(config: AVPDataParserConfig) -> None:
-    if config.data == Path():
-        raise RolloutError("avp-data: no rollout named; add --data with a rollout's folder")
-    for option, value, least, above in (
-        ("--scale", config.scale, 0, True),
-        ("--every", config.every, 1, False),
-        ("--max-views", config.max_views, 0, False),
-        ("--initial-points", config.initial_points, 0, False),
-        ("--box-margin-m", config.box_margin_m, 0, False),
-    ):
-        if not (np.isfinite(value) and (value > least if above else value >= least)):
-            raise RolloutError(
-                f"avp-data: expected {option} {'above' if above else 'of at least'} {least}, got {value}"
-            )
-    orders = get_args(Order)
-    if config.order not in orders:
-        raise RolloutError(f"avp-data: unknown --order {config.order!r}: expected one of {', '.join(orders)}")

@@ -38,28 +38,10 @@ class Size:
     """Cells of the finest level along the scene box."""
 
 
-CPU = Size(
-    iterations=6000,
-    rays=1024,
-    rays_per_chunk=1 << 12,
-    proposal_samples=64,
-    samples=8,
-    levels=10,
-    log2_table=17,
-    finest=1024,
-)
-"""Chosen by trials on white_room (docs/reconstruction.md): more and cheaper rays beat more samples on each."""
-CUDA = Size(
-    iterations=30_000,
-    rays=4096,
-    rays_per_chunk=1 << 15,
-    proposal_samples=128,
-    samples=24,
-    levels=16,
-    log2_table=19,
-    finest=2048,
-)
-"""The tables and rays of nerfacto; not measured, for want of such a device."""
+# By trials on white_room (docs/reconstruction.md): more and cheaper rays beat more samples on each.
+CPU = Size(6000, 1024, 1 << 12, proposal_samples=64, samples=8, levels=10, log2_table=17, finest=1024)
+# The tables and rays of nerfacto; not measured, for want of such a device.
+CUDA = Size(30_000, 4096, 1 << 15, proposal_samples=128, samples=24, levels=16, log2_table=19, finest=2048)
 
 
 @dataclass

@@ -111,11 +111,8 @@ class CompiledHashEncoding(HashEncoding):
     def __init__(self, like: HashEncoding) -> None:
         """Take over the shape and the table of another hash encoding of the torch implementation."""
         nn.Module.__init__(self)
-        self.in_dim = like.in_dim
-        self.num_levels, self.min_res = like.num_levels, like.min_res
-        self.features_per_level, self.hash_init_scale = like.features_per_level, like.hash_init_scale
-        self.log2_hashmap_size, self.hash_table_size = like.log2_hashmap_size, like.hash_table_size
-        self.growth_factor, self.scalings, self.hash_offset = like.growth_factor, like.scalings, like.hash_offset
+        # Its settings; parameters and modules are kept elsewhere.
+        self.__dict__.update({name: value for name, value in vars(like).items() if not name.startswith("_")})
         self.tcnn_encoding = None
         self.hash_table = like.hash_table
         self._scalings = like.scalings.numpy().astype(np.float32)
@@ -135,3 +132,11 @@ def compile_hash_encodings(module: nn.Module) -> None:
         for name, child in list(parent.named_children()):
             if type(child) is HashEncoding and child.tcnn_encoding is None:
                 setattr(parent, name, CompiledHashEncoding(child))
+
+
+def compile_loops() -> None:
+    """Load the compiled loops from numba's cache, or compile them, for the types that trainings call them with."""
+    positions, scalings = np.zeros((1, 3), np.float32), np.ones(1, np.float32)
+    table, encoded = np.zeros((8, 2), np.float32), np.zeros((1, 2), np.float32)
+    _encode(positions, scalings, table, 7, encoded)
+    _spread(positions, scalings, 7, encoded, table)

@@ -1,25 +1,110 @@
-"""A reconstruction as an MLflow run: which run it is, and whose child."""
+"""A reconstruction as an MLflow run: its settings and origin, which run it is, and whose child."""
 
+import dataclasses
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from avp_habitat.provenance import flat
+from avp_habitat.rollout.format import read_meta
+from avp_habitat.tracking import names, rollout_run
 from avp_habitat.tracking.deliver import finish
 from avp_habitat.tracking.experiments import find_run
 from avp_habitat.tracking.journal import Journal, journal_of
-from avp_habitat.tracking.names import CONTINUED_TAG, POLICY_RUN_TAG, ROLLOUT_RUN_TAG
-from avp_habitat.tracking.rollout_run import rollout_run
+from avp_habitat.tracking.names import safe_name
 from avp_habitat.tracking.run import NewRun, TrackedRun, continue_run, join_run, may_continue, start_run
 from avp_habitat.tracking.stores import TrackingError, open_store
-from avp_nerfstudio.tracking.facts import Facts, joined
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 RUN_FILE = "mlflow_run_id.txt"
 """In a training's folder: the id of its run."""
+# Of no meaning for the result; `mlflow` is an address, which may hold a password.
+_NOT_SETTINGS = ("viewer.", "mlflow", "rerun", "logging.local_writer.", "load_config")
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is known of a reconstruction without looking at its course."""
+
+    name: str
+    """Of the run."""
+    params: Mapping[str, str] = field(default_factory=dict)
+    """The settings, flat."""
+    tags: Mapping[str, str] = field(default_factory=dict)
+    """Method, scene, policy."""
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    """The figures of the rollout it was made from: `eval/...`, or `rollout/...` when it is not the whole of one."""
+    rollouts: tuple[Path, ...] = ()
+    """Folders of the rollouts."""
+    policy_runs: tuple[str, ...] = ()
+    """MLflow runs in which the rollouts' policies were trained, each once."""
+
+
+def facts_of(config: Any) -> Facts:
+    """The facts of a training.
+
+    Args:
+        config: nerfstudio's `TrainerConfig`; its rollout, if it has one, is still where it says.
+
+    Raises:
+        RolloutError: `rollout.json` or `steps.csv` cannot be read.
+    """
+    config.set_experiment_name()
+    tags = {names.METHOD_TAG: str(config.method_name), names.KIND_TAG: names.RECONSTRUCTION}
+    name = f"{config.method_name} {config.experiment_name}"
+    folders = tuple(rollout_folders(config))
+    if not folders:
+        return Facts(name, _settings(config), tags)
+    metas = [read_meta(folder) for folder in folders]
+    ids = [rollout_run.policy_run_id(folder, meta) for folder, meta in zip(folders, metas, strict=True)]
+    policy_runs = tuple(dict.fromkeys(run_id for run_id in ids if run_id is not None))
+    tags |= rollout_run.origin(metas[0]) | {
+        names.ROLLOUT_TAG: _joined(folders),
+        names.ROLLOUT_ID_TAG: _joined(map(rollout_run.rollout_id, folders)),
+    }
+    if policy_runs:
+        tags[names.POLICY_RUN_TAG] = _joined(policy_runs)
+    title = rollout_run.title(metas[0])
+    if title is not None and len(folders) == 1 and config.experiment_name in (folders[0].stem, "unnamed"):
+        # nerfstudio's own names: that of the folder, or none where the data is given to the dataparser.
+        name = f"{config.method_name} {title}"
+    # The figures of a rollout are those of all its frames and of no others.
+    parser = getattr(config.pipeline.datamanager, "dataparser", None)
+    usual = (("also", ()), ("every", 1), ("max_views", 0))
+    whole = all(getattr(parser, option, value) == value for option, value in usual)
+    params = _settings(config) | rollout_run.rollout_params(metas[0])
+    figures = rollout_run.figures(metas[0], "eval" if whole else "rollout")
+    return Facts(name, params, tags, figures, folders, policy_runs)
+
+
+def rollout_folders(config: Any) -> list[Path]:
+    """The rollouts that a training reads, whatever its dataparser; none when its data is something else."""
+    manager = config.pipeline.datamanager
+    parser = getattr(manager, "dataparser", None)
+    data = manager.data or getattr(parser, "data", None)
+    if data is None or data == Path():
+        return []
+    paths = [Path(path) for path in (data, *getattr(parser, "also", ()))]
+    folders = [path.parent if path.is_file() else path for path in paths]
+    return folders if all((folder / "rollout.json").is_file() for folder in folders) else []
+
+
+def _settings(config: Any) -> dict[str, str]:
+    """All settings by dotted name, without those that cannot change the result."""
+    return {
+        safe_name(key): str(value)
+        for key, value in flat(dataclasses.asdict(config)).items()
+        if not key.startswith(_NOT_SETTINGS) and not key.endswith("_target")
+    }
+
+
+def _joined(values: Iterable[object]) -> str:
+    return ", ".join(map(str, values))[: names.MAX_TAG]
 
 
 def open_run(
@@ -35,7 +120,7 @@ def open_run(
         facts: of the training.
         folder: of the training, where the run's id is remembered.
         experiment: MLflow's, made when it does not exist; when neither named nor given by the runs above,
-            as `experiments.chosen_experiment` says.
+            as `experiments.meant` says.
         earlier: id of the run that is continued.
 
     Raises:
@@ -46,10 +131,9 @@ def open_run(
         run = continue_run(address, earlier)
         # Its origin and figures stay as they are; settings that are no longer the same are noted in a tag.
         run.params(facts.params)
-    else:
-        run = _new(address, facts, experiment, {} if earlier is None else {CONTINUED_TAG: earlier})
-    _remember(folder, run)
-    return run
+        _remember(folder, run)
+        return run
+    return _new(address, facts, folder, experiment, {} if earlier is None else {names.CONTINUED_TAG: earlier})
 
 
 def open_again(address: str, facts: Facts, *, folder: Path, experiment: str | None = None) -> tuple[TrackedRun, bool]:
@@ -69,19 +153,13 @@ def open_again(address: str, facts: Facts, *, folder: Path, experiment: str | No
     """
     client, run_id = open_store(address), remembered_id(folder)
     run = _again(client, address, run_id) if run_id is not None else None
-    if run is not None:
-        return run, True
-    run = _new(address, facts, experiment, {})
-    _remember(folder, run)
-    return run, False
+    return (run, True) if run is not None else (_new(address, facts, folder, experiment, {}), False)
 
 
 def remembered_id(folder: Path) -> str | None:
     """The run id that a training's folder remembers; MLflow's, or one that was given offline."""
-    try:
-        return (folder / RUN_FILE).read_text(encoding="ascii").strip() or None
-    except (OSError, UnicodeDecodeError):
-        return None
+    path = folder / RUN_FILE
+    return path.read_text(encoding="ascii").strip() if path.is_file() else None
 
 
 def _remember(folder: Path, run: TrackedRun) -> None:
@@ -89,7 +167,7 @@ def _remember(folder: Path, run: TrackedRun) -> None:
     try:
         path.write_text(run.run_id + "\n", encoding="ascii")
     except OSError as error:
-        warnings.warn(f"{path}: a later log will make a new run, because this failed: {error}", stacklevel=3)
+        warnings.warn(f"{path}: a later log will make a new run, because this failed: {error}", stacklevel=4)
 
 
 def _again(client: "MlflowClient | None", address: str, run_id: str) -> TrackedRun | None:
@@ -99,48 +177,35 @@ def _again(client: "MlflowClient | None", address: str, run_id: str) -> TrackedR
         with suppress(TrackingError):
             return continue_run(address, run_id)
         return None
-    _deliver_left(run_id)
+    # What it could not send while it lasted comes first; if its program was killed, that closes it.
+    left = journal_of(run_id)
+    journal = None if left is None else Journal.adopt(left)
+    if journal is not None:
+        finish(journal)
     found = find_run(client, run_id)
     return None if found is None else join_run(address, found.info.run_id)
 
 
-def _deliver_left(run_id: str) -> None:
-    """Send what a run could not send while it lasted, and close it if its program was killed."""
-    folder = journal_of(run_id)
-    journal = None if folder is None else Journal.adopt(folder)
-    if journal is not None:
-        finish(journal)
-
-
-def _new(address: str, facts: Facts, experiment: str | None, tags: Mapping[str, str]) -> TrackedRun:
-    above = _Above(open_store(address), facts, experiment)
-    new = NewRun(
-        experiment=above.experiment, name=facts.name, tags={**facts.tags, **above.tags, **tags}, parent=above.parent
-    )
+def _new(address: str, facts: Facts, folder: Path, experiment: str | None, tags: Mapping[str, str]) -> TrackedRun:
+    """A run below that of the rollout, or else of the policy; without a client only what the rollouts say is known."""
+    client = open_store(address)
+    policy = facts.policy_runs[0] if len(facts.policy_runs) == 1 else None
+    parent, above = policy, {}
+    if client is not None:
+        rollouts = [rollout_run.rollout_run(client, rollout, experiment=experiment) for rollout in facts.rollouts]
+        found = {run_id: find_run(client, run_id) for run_id in facts.policy_runs}
+        if rollouts:
+            above[names.ROLLOUT_RUN_TAG] = _joined(rollouts)
+        if found:
+            ids = (run.info.run_id if run else given for given, run in found.items())
+            above[names.POLICY_RUN_TAG] = _joined(ids)
+        run_above = find_run(client, rollouts[0] if len(rollouts) == 1 else policy)
+        parent = None if run_above is None else run_above.info.run_id
+        if run_above is not None and experiment is None:
+            experiment = client.get_experiment(run_above.info.experiment_id).name
+    new = NewRun(experiment=experiment, name=facts.name, tags={**facts.tags, **above, **tags}, parent=parent)
     run = start_run(address, new)
     run.params(facts.params)
     run.metrics(facts.metrics, step=0)
+    _remember(folder, run)
     return run
-
-
-class _Above:
-    """The runs above a new one: rollout, or else policy."""
-
-    def __init__(self, client: "MlflowClient | None", facts: Facts, experiment: str | None) -> None:
-        """Find them, and make those of the rollouts; without a client only what the rollouts say is known."""
-        policy = facts.policy_runs[0] if len(facts.policy_runs) == 1 else None
-        self.tags: dict[str, str] = {}
-        self.parent = policy
-        self.experiment = experiment
-        if client is None:
-            return
-        rollouts = [rollout_run(client, folder, experiment=experiment) for folder in facts.rollouts]
-        found = {run_id: find_run(client, run_id) for run_id in facts.policy_runs}
-        if rollouts:
-            self.tags[ROLLOUT_RUN_TAG] = joined(rollouts)
-        if found:
-            self.tags[POLICY_RUN_TAG] = joined(run.info.run_id if run else given for given, run in found.items())
-        parent = find_run(client, rollouts[0] if len(rollouts) == 1 else policy)
-        self.parent = None if parent is None else parent.info.run_id
-        if parent is not None and experiment is None:
-            self.experiment = client.get_experiment(parent.info.experiment_id).name

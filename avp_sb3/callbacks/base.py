@@ -1,14 +1,13 @@
-"""Finding the episodes that ended in the step that Stable-Baselines3 just took."""
+"""What the callbacks share: episodes that ended, files to log, and who called."""
 
-import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+import traceback
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.logger import Logger
 
 from avp_habitat.errors import AVPError
 
@@ -26,62 +25,27 @@ class LoggedFile:
     """How the artifact is called, `/` for folders: an artifact of the same name is replaced."""
 
 
-@contextmanager
-def logged_alone(callback: BaseCallback) -> Iterator[None]:
-    """What is recorded within the block is dumped at its end, at the current step and without what was pending.
-
-    SB3's own `EvalCallback` dumps the training's pending values, too: half of a rollout's figures, and the last
-    update's losses at a step at which there was none.
-    """
-    logger = callback.logger
-    pending = {name: getattr(logger, name) for name in ("name_to_value", "name_to_count", "name_to_excluded")}
-    for name, held in pending.items():
-        empty = held.copy()
-        empty.clear()
-        setattr(logger, name, empty)
-    try:
-        yield
-        logger.record("time/total_timesteps", callback.num_timesteps, exclude=("tensorboard", "mlflow"))
-        logger.dump(callback.num_timesteps)
-    finally:
-        for name, held in pending.items():
-            setattr(logger, name, held)
+_LONGEST = 33
+"""Letters behind the first `/` of a name: SB3 cuts longer ones on the screen, and refuses two that are then equal."""
 
 
-def move_to_front(callback: BaseCallback, whole: Any) -> bool:
-    """Let a callback come first, so that its last figures reach trackers that close at the end of the training.
-
-    Args:
-        callback: to be first.
-        whole: what `learn` calls. The lists that the caller made stay as they are.
-
-    Returns:
-        Whether the callback is in `whole`.
-    """
-    if not isinstance(whole, CallbackList):
-        return whole is callback
-    holds = [move_to_front(callback, part) for part in whole.callbacks]
-    order = sorted(range(len(holds)), key=lambda number: not holds[number])
-    whole.callbacks = [whole.callbacks[number] for number in order]
-    return any(holds)
-
-
-def is_learning(model: Any) -> bool:
-    """Whether `model.learn` is among the callers.
-
-    rl_zoo3 calls the first callback's `on_training_end` once more in a `finally`, whatever ended the training; only
-    `learn` itself calls it when the training came to its own end.
-    """
-    frame = sys._getframe()
-    while frame is not None:
-        if frame.f_code.co_name == "learn" and frame.f_locals.get("self") is model:
-            return True
-        frame = frame.f_back
-    return False
+def record(logger: Logger, name: str, value: float) -> None:
+    """Record a figure, which is not shown on the screen where its name is too long for that."""
+    logger.record(name, value, ("stdout", "log") if len(name.partition("/")[2]) > _LONGEST else None)
 
 
 class MissingInfoError(AVPError):
     """An environment that does not report what a callback reads."""
+
+
+def is_learning(model: Any) -> bool:
+    """Whether `model.learn` is among the callers, which says that a training came to its own end.
+
+    rl_zoo3 calls the first callback's `on_training_end` once more in a `finally`, whatever ended the training; SB3 has
+    no hook that tells the two apart.
+    """
+    frames = (frame for frame, _ in traceback.walk_stack(None) if frame.f_code.co_name == "learn")
+    return any(frame.f_locals.get("self") is model for frame in frames)
 
 
 def finished_episodes(locals_: Mapping[str, Any]) -> list[tuple[int, dict[str, Any]]]:
@@ -90,11 +54,7 @@ def finished_episodes(locals_: Mapping[str, Any]) -> list[tuple[int, dict[str, A
     Args:
         locals_: a callback's `self.locals`.
     """
-    dones = np.asarray(locals_["dones"])
-    if not dones.any():
-        return []
-    infos = locals_["infos"]
-    return [(int(index), infos[index]) for index in np.flatnonzero(dones)]
+    return [(int(index), locals_["infos"][index]) for index in np.flatnonzero(locals_["dones"])]
 
 
 def required(info: Mapping[str, Any], key: str, *, reader: str, inside: str = "info") -> Any:

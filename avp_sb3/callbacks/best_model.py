@@ -5,20 +5,20 @@ import os
 import uuid
 import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Iterable
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from avp_habitat.errors import AVPError, UsageError
+from avp_habitat.errors import AVPError, UsageError, unknown_name
+from avp_habitat.files import atomic_file, check_writable
 from avp_habitat.policies.saved_model import statistics_names
+from avp_sb3.evaluation.policy import figures_of
 
 WHEN = "DATE-TIME"
 """In a file's name: replaced by when the training started."""
-LESS_IS_BETTER = frozenset({"views", "path_length_m", "collisions", "redundant_share"})
-"""Scores of which the smallest is the best."""
 _TRAINING, _BEST = "avp_training_id", "avp_best"
 
 
@@ -46,13 +46,21 @@ class BestModel:
         self._wanted = None if path is None else Path(path)
         self._score = score
 
-    def start(self, model: BaseAlgorithm) -> None:
+    def start(self, model: BaseAlgorithm, metrics: Iterable[Any] = ()) -> None:
         """Find the file's name, and go on from the file that is there when it is this training's own.
 
+        Args:
+            model: that trains.
+            metrics: of the user, as `TaskSettings.metrics`; the score may be one of them.
+
         Raises:
-            UsageError: the file is another training's, or this one's best by another score.
+            UsageError: there is no such score, or the file is another training's, or its best by another score.
             BestModelError: the folder cannot be written.
         """
+        known = figures_of(metrics)
+        if self._score not in known:
+            raise unknown_name("score", self._score, known)
+        self._lower = known[self._score].better == "lower"
         if not hasattr(model, _TRAINING):
             # From the system: the training's own random numbers stay as they are.
             setattr(model, _TRAINING, uuid.uuid4().hex)
@@ -63,13 +71,7 @@ class BestModel:
         files = [path] if model.get_vec_normalize_env() is None else [path, statistics_of(path)]
         if found := [file for file in files if file.is_symlink() or file.exists()]:
             self.value = self._own_value(path, found[0], getattr(model, _TRAINING))
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with _part(path).open("ab"):
-                pass
-            _part(path).unlink()
-        except OSError as error:
-            raise BestModelError(f"best_model {path}: cannot be written there: {error.strerror or error}") from None
+        check_writable(path, failure=BestModelError, option="best_model")
 
     def offer(self, model: BaseAlgorithm, value: float) -> bool:
         """Keep the model if its score is better than all before; whether it was kept.
@@ -89,8 +91,9 @@ class BestModel:
         return True
 
     def _is_better(self, value: float) -> bool:
-        sign = -1 if self._score in LESS_IS_BETTER else 1
-        return value == value and (self.value is None or sign * value > sign * self.value)
+        if self.value is None or value != value:
+            return value == value
+        return value < self.value if self._lower else value > self.value
 
     def _path(self) -> Path:
         assert self._wanted is not None
@@ -133,22 +136,10 @@ def save_model(model: BaseAlgorithm, path: Path) -> None:
     """
     normalised = model.get_vec_normalize_env()
     if normalised is not None:
-        _replace(statistics_of(path), normalised.save)
-    _replace(path, model.save)
-
-
-def _replace(path: Path, save: Callable[[str], None]) -> None:
-    part = _part(path)
-    try:
-        save(os.fspath(part))
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
-
-
-def _part(path: Path) -> Path:
-    # Stable-Baselines3 leaves a name alone only when it has a suffix.
-    return path.with_name(f"{path.name}.{os.getpid()}.part")
+        with atomic_file(statistics_of(path)) as file:
+            normalised.save(os.fspath(file))
+    with atomic_file(path) as file:
+        model.save(file)
 
 
 def _held(path: Path) -> dict[str, Any]:

@@ -2,27 +2,17 @@
 
 import sys
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
 
 from avp_habitat.command import progress
 from avp_habitat.metrics import coverage_per_view
-from avp_sb3.callbacks.base import MissingInfoError, finished_episodes, required
+from avp_sb3.callbacks.base import MissingInfoError, finished_episodes, record, required
+from avp_sb3.evaluation.policy import RETURN
 
-MEANS = {
-    "coverage": "avp/coverage",
-    "views": "avp/views",
-    "annd_m": "avp/annd_m",
-    "ei": "avp/ei",
-    "stopped": "avp/stop_share",
-    "collisions": "avp/collisions",
-    "redundant_views": "avp/redundant_views",
-}
-"""Keys of `info["avp_episode"]`, and the names under which their means are recorded."""
-_RETURN = "return_"
 _READER, _INSIDE = "MetricsCallback", "info['avp_episode']"
 
 
@@ -33,57 +23,57 @@ class EpisodeWindow:
         """Make an empty window of at most `size` episodes."""
         if size < 1:
             raise ValueError(f"expected a window of at least 1 episode, got {size}")
-        self._size = size
-        self._keys = [*MEANS]
-        self._rows = np.zeros((size, len(self._keys)))
+        self._names: dict[str, str] = {}
+        self._rows = np.empty((size, 0))
         self._added = 0
 
-    def add(self, episode: Mapping[str, float]) -> None:
+    def add(self, episode: Mapping[str, Any]) -> None:
         """Take in an episode, in place of the oldest one when the window is full.
 
         Args:
-            episode: `info["avp_episode"]`.
+            episode: `info["avp_episode"]`: coverage, views and any other figures.
 
         Raises:
-            MissingInfoError: a key of `MEANS`, or the return of a reward part that earlier episodes had, is missing or
-                no number.
+            MissingInfoError: coverage or views is missing, or a figure is no number.
         """
-        new = [key for key in episode if key.startswith(_RETURN) and key not in self._keys]
-        if new:
-            # A part that earlier episodes did not have gave them nothing.
-            self._keys += sorted(new)
-            self._rows = np.hstack([self._rows, np.zeros((self._size, len(new)))])
-        self._rows[self._added % self._size] = [_number(episode, key) for key in self._keys]
+        for key in ("coverage", "views"):
+            required(episode, key, reader=_READER, inside=_INSIDE)
+        if new := {key: _name(key) for key in episode if key not in self._names}:
+            self._names |= new
+            self._rows = np.hstack([self._rows, np.tile([_number({}, key) for key in new], (len(self._rows), 1))])
+        self._rows[self._added % len(self._rows)] = [_number(episode, key) for key in self._names]
         self._added += 1
 
     def means(self) -> dict[str, float]:
-        """Means over the window by the name to record, with CpV; empty before the first episode.
+        """Means over the window by the name to record, with CpV.
 
-        An episode in which a figure is nan, not known, does not count for it; a figure that no episode of the window
-        knows is left out.
+        An episode that does not know a figure (missing or nan) does not count for it; a figure that no episode of the
+        window knows is left out.
         """
-        if not self._added:
-            return {}
         rows = self._rows[: self._added]
-        mean = rows.mean(axis=0)
-        if np.isnan(mean).any():
-            mean = _known_mean(rows)
-        by_key = dict(zip(self._keys, mean.tolist(), strict=True))
-        named = {MEANS.get(key) or f"reward/{key.removeprefix(_RETURN)}": value for key, value in by_key.items()}
-        named["avp/cpv"] = coverage_per_view(np.array([by_key["coverage"]]), np.array([by_key["views"]]))
-        return {name: value for name, value in named.items() if value == value}
+        known = ~np.isnan(rows)
+        counts = known.sum(axis=0)
+        mean = np.where(known, rows, 0.0).sum(axis=0) / np.maximum(counts, 1)
+        found = {
+            name: value
+            for name, value, count in zip(self._names.values(), mean.tolist(), counts.tolist(), strict=True)
+            if count
+        }
+        if "avp/coverage" in found and "avp/views" in found:
+            found["avp/cpv"] = coverage_per_view(np.array([found["avp/coverage"]]), np.array([found["avp/views"]]))
+        return found
 
 
-def _known_mean(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean of each column over what is not nan; nan for a column of nothing else."""
-    known = ~np.isnan(rows)
-    counts = known.sum(axis=0)
-    sums = np.where(known, rows, 0.0).sum(axis=0)
-    return np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0)
+def _name(key: str) -> str:
+    """Under which the mean of a figure, or of the return of a reward's part, is recorded."""
+    if key.startswith(RETURN):
+        return f"reward/{key.removeprefix(RETURN)}"
+    return "avp/stop_share" if key == "stopped" else f"avp/{key}"
 
 
-def _number(episode: Mapping[str, float], key: str) -> float:
-    value = required(episode, key, reader=_READER, inside=_INSIDE)
+def _number(episode: Mapping[str, Any], key: str) -> float:
+    # A part of the reward that an episode does not have gave it nothing; another figure is not known.
+    value = episode.get(key, 0.0 if key.startswith(RETURN) else np.nan)
     try:
         return float(value)
     except (TypeError, ValueError):
@@ -91,11 +81,11 @@ def _number(episode: Mapping[str, float], key: str) -> float:
 
 
 class MetricsCallback(BaseCallback):
-    """Records coverage, CpV, ANND, EI, views, stop share, collisions, redundancy and the return of each reward part.
+    """Records every figure of `info["avp_episode"]` (coverage, views, ANND …), CpV, and the return of each reward part.
 
-    They appear wherever SB3 logs (screen, CSV, TensorBoard, MLflow) as `avp/...` and `reward/...`, averaged over the
-    last `window` episodes like SB3's own `rollout/ep_rew_mean`. Where SB3 itself prints nothing (`verbose=0` and no
-    progress bar on a terminal), this shows how far the training is: steps, rate, time left, coverage.
+    They appear wherever SB3 logs (screen, CSV, TensorBoard, MLflow) as `avp/FIGURE` and `reward/PART`, averaged over
+    the last `window` episodes like SB3's own `rollout/ep_rew_mean`. Where SB3 itself prints nothing (`verbose=0` and
+    no progress bar on a terminal), this shows how far the training is: steps, rate, time left, coverage.
     """
 
     def __init__(self, window: int = 100, verbose: int = 1) -> None:
@@ -149,4 +139,4 @@ class MetricsCallback(BaseCallback):
 
     def _record(self) -> None:
         for name, value in self._window.means().items():
-            self.logger.record(name, value)
+            record(self.logger, name, value)

@@ -8,19 +8,21 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 from io import BytesIO
-from numbers import Real
-from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mlflow
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Figure, Image, KVWriter
 
 from avp_habitat.errors import UsageError
 from avp_habitat.provenance import flat
+from avp_habitat.rollout.drawing import draw_trajectory
+from avp_habitat.rollout.images import write_rgb
+from avp_habitat.task.trajectory import Trajectory
 from avp_habitat.tracking.deliver import recover_in_background
 from avp_habitat.tracking.names import CONTINUED_TAG, KIND_TAG, RESUMED_TAG
 from avp_habitat.tracking.run import NewRun, Status, TrackedRun, continue_run, join_run, may_continue, start_run
@@ -28,12 +30,10 @@ from avp_habitat.tracking.stores import DEFAULT_ADDRESS, about_run, shown
 from avp_sb3.callbacks.base import LoggedFile, finished_episodes, is_learning
 from avp_sb3.callbacks.run_facts import hyperparameters, run_name, scene_tags, task_settings
 
-if TYPE_CHECKING:
-    from avp_habitat.task.trajectory import Trajectory
-
-
 FORMAT = "mlflow"
 """The name by which `logger.record(..., exclude="mlflow")` keeps a value away from MLflow."""
+MODEL_FILE, STATISTICS_FILE, PARAMS_FILE = "model.zip", "model_vecnormalize.pkl", "params.json"
+TRAJECTORY_FILE = "trajectory.png"
 _log = logging.getLogger(__name__)
 
 
@@ -53,9 +53,10 @@ class MLflowWriter(KVWriter):
                 continue
             if isinstance(value, str):
                 texts[key] = value
-            elif (number := _number(value)) is not None:
-                numbers[key] = number
-            else:
+                continue
+            try:
+                numbers[key] = float(value)
+            except (TypeError, ValueError):
                 self._keep(key, value, step)
         self._run.metrics(numbers, step)
         self._run.tags(texts)
@@ -73,23 +74,12 @@ class MLflowWriter(KVWriter):
             _log.warning("%s: MLflow takes numbers, texts, pictures and files here, not %s", key, type(value).__name__)
 
 
-def _number(value: Any) -> float | None:
-    """A Python, numpy or one-element tensor number as float; None for anything else."""
-    if isinstance(value, Real):
-        return float(value)
-    if getattr(value, "shape", None) == () and hasattr(value, "item"):
-        return float(value.item())
-    return None
-
-
 def _pixels(value: Image | Figure) -> NDArray[np.uint8] | None:
     """A picture as `(h, w, 3)` bytes; None for an arrangement of axes other than HWC, CHW and HW."""
     if isinstance(value, Figure):
-        from PIL import Image as Files
-
         buffer = BytesIO()
         value.figure.savefig(buffer, format="png")
-        return np.asarray(Files.open(buffer).convert("RGB"))
+        return np.asarray(PIL.Image.open(buffer).convert("RGB"))
     pixels = np.asarray(value.image)
     order = {"HWC": (0, 1, 2), "CHW": (1, 2, 0), "HW": (0, 1)}.get(value.dataformats.upper())
     if order is None or pixels.ndim != len(order):
@@ -100,11 +90,6 @@ def _pixels(value: Image | Figure) -> NDArray[np.uint8] | None:
         pixels = np.clip(255 * pixels, 0, 255).round()
     pixels = pixels.astype(np.uint8).reshape(*pixels.shape[:2], -1)[..., :3]
     return np.repeat(pixels, 3, axis=-1) if pixels.shape[-1] == 1 else pixels
-
-
-MODEL_FILE, STATISTICS_FILE = "model.zip", "model_vecnormalize.pkl"
-PARAMS_FILE = "params.json"
-TRAJECTORY_FILE = "trajectory.png"
 
 
 class MLflowCallback(BaseCallback):
@@ -148,14 +133,14 @@ class MLflowCallback(BaseCallback):
         """Describe the run; nothing is contacted before the training starts.
 
         Args:
-            experiment: MLflow experiment, made when it does not exist; when omitted, what `mlflow.set_experiment`,
-                `MLFLOW_EXPERIMENT_ID` or `MLFLOW_EXPERIMENT_NAME` say, else `avp`. Not used within an active run.
-            run_name: name of the run; when omitted, algorithm, reward, scene and seed.
-            tracking_uri: where runs are kept; when omitted, what `mlflow.set_tracking_uri` or `MLFLOW_TRACKING_URI`
-                say, else `sqlite:///mlflow.db` in the current folder.
+            experiment: MLflow experiment, made when it does not exist; when omitted, what MLflow's functions or
+                variables say, else `avp`. Not used within an active run.
+            run_name: when omitted, algorithm, reward, scene and seed.
+            tracking_uri: where runs are kept; when omitted, what MLflow's functions or variables say, else
+                `sqlite:///mlflow.db` in the current folder.
             run_id: go on with this run; when omitted, with the model's own if it was interrupted.
-            log_model: keep the model as artifact `model.zip`, at the end unless the training failed, and on the way;
-                with `model_vecnormalize.pkl` where it trains under `VecNormalize`.
+            log_model: keep the model (with the statistics of `VecNormalize`) as artifact `model.zip`, on the way and at
+                the end unless the training failed.
             checkpoint_s: seconds between two models that are kept on the way, each in place of the one before.
             offline: True goes on when the server does not answer at the start, and sends everything later; when
                 omitted, as the variable `AVP_MLFLOW_OFFLINE` says.
@@ -191,7 +176,7 @@ class MLflowCallback(BaseCallback):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close a run that is still open with the status that the exception deserves."""
-        self.close("KILLED" if kind is None else _status_of(error))
+        self.close(_status_of(error))
 
     def close(self, status: Status = "KILLED") -> None:
         """Send what is left and close the run with this status, if it is still open."""
@@ -200,7 +185,10 @@ class MLflowCallback(BaseCallback):
         run, self._run = self._run, None
         atexit.unregister(self._close_at_exit)
         try:
-            self._write_pending_values()
+            if self._writer is not None:
+                # What came after the logger's last dump: the last update's losses, or what an interruption cut off.
+                pending, excluded = self.logger.name_to_value, self.logger.name_to_excluded
+                self._writer.write(pending, excluded, self.model.num_timesteps)
             if status != "FAILED":
                 self._save_model(run)
                 self._save_trajectory(run)
@@ -218,8 +206,8 @@ class MLflowCallback(BaseCallback):
     def _on_training_start(self) -> None:
         self.close("KILLED")
         self._last_episode = None
-        earlier = self._models_run()
-        self._run = run = self._open_run()
+        earlier = getattr(self.model, "avp_mlflow_run_id", None)
+        self._run = run = self._open_run(earlier)
         self._remember(run)
         atexit.register(self._close_at_exit)
         try:
@@ -252,8 +240,8 @@ class MLflowCallback(BaseCallback):
         # rl_zoo3 calls this once more in a `finally`, whatever ended `learn()`.
         self.close("FINISHED" if is_learning(self.model) else _status_of(sys.exc_info()[1]))
 
-    def _open_run(self) -> TrackedRun:
-        """The active run, the one to go on with, or a new one."""
+    def _open_run(self, earlier: str | None) -> TrackedRun:
+        """The active run, the one to go on with, or a new one; `earlier` trained the model so far."""
         configured = mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else DEFAULT_ADDRESS
         active = mlflow.active_run()
         if active is not None:
@@ -266,15 +254,10 @@ class MLflowCallback(BaseCallback):
         address = self._tracking_uri or configured
         if self._wanted_run is not None:
             return continue_run(address, self._wanted_run, offline=self._offline)
-        earlier = self._models_run() if self.model.num_timesteps > 0 else None
-        if earlier is not None and may_continue(address, earlier):
+        if earlier is not None and self.model.num_timesteps > 0 and may_continue(address, earlier):
             return continue_run(address, earlier, offline=self._offline)
         name = self._new.name or run_name(self.model, self.training_env)
         return start_run(address, replace(self._new, name=name), offline=self._offline)
-
-    def _models_run(self) -> str | None:
-        """The run that trained the model so far."""
-        return getattr(self.model, "avp_mlflow_run_id", None)
 
     def _remember(self, run: TrackedRun) -> None:
         """Keep the run's id, also within the model's .zip, so that a rollout can name the run of its policy."""
@@ -296,11 +279,6 @@ class MLflowCallback(BaseCallback):
         text = json.dumps(params, indent=1, default=str) + "\n"
         run.save(PARAMS_FILE, lambda file: file.write_text(text, encoding="utf-8"))
 
-    def _write_pending_values(self) -> None:
-        """Values recorded after the logger's last dump: the last update's losses, or what an interruption cut off."""
-        if self._writer is not None:
-            self._writer.write(self.logger.name_to_value, self.logger.name_to_excluded, self.model.num_timesteps)
-
     def _save_model(self, run: TrackedRun) -> None:
         if self._log_model:
             if (normalised := self.model.get_vec_normalize_env()) is not None:
@@ -310,17 +288,11 @@ class MLflowCallback(BaseCallback):
     def _save_trajectory(self, run: TrackedRun) -> None:
         if self._last_episode is not None and self.training_env.has_attr("area"):
             index, trajectory = self._last_episode
-            run.save(TRAJECTORY_FILE, lambda file: self._draw(file, index, trajectory))
-
-    def _draw(self, path: Path, index: int, trajectory: "Trajectory") -> None:
-        from avp_habitat.rollout.drawing import draw_trajectory
-        from avp_habitat.rollout.images import write_rgb
-
-        write_rgb(path, draw_trajectory(self.training_env.get_attr("area", index)[0], trajectory))
+            picture = draw_trajectory(self.training_env.get_attr("area", index)[0], trajectory)
+            run.save(TRAJECTORY_FILE, lambda file: write_rgb(file, picture))
 
     def _close_at_exit(self) -> None:
-        error = getattr(sys, "last_value", None)
-        self.close("KILLED" if error is None else _status_of(error))
+        self.close(_status_of(getattr(sys, "last_value", None)))
 
 
 def _status_of(error: BaseException | None) -> Status:

@@ -1,27 +1,43 @@
 """Finished episodes of a training as a Rerun recording, in a file and live."""
 
 import atexit
+import functools
 import shlex
+import shutil
+import socket
 import sys
+import sysconfig
 import time
+from collections.abc import Iterator, Mapping
 from datetime import datetime
+from numbers import Real
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
+from uuid import uuid4
 
 import rerun as rr
 from stable_baselines3.common.callbacks import BaseCallback
 
-from avp_habitat.errors import UsageError
+from avp_habitat.errors import AVPError, UsageError
+from avp_habitat.files import check_new
 from avp_sb3.callbacks.base import finished_episodes, required
-from avp_sb3.rerun.destination import RecordedEnvironments
-from avp_sb3.rerun.episode import episode_of, log_episode
-from avp_sb3.rerun.figures import EpisodeFigures
-from avp_sb3.rerun.file import RecordingFile, new_recording_file
-from avp_sb3.rerun.layout import blueprint, eye_above
-from avp_sb3.rerun.live import LiveViewer
+from avp_sb3.rerun import APPLICATION
+from avp_sb3.rerun.environments import RecordedEnvironments
+from avp_sb3.rerun.episode import episode_of, log_episode, metric_path
+from avp_sb3.rerun.layout import eye_above, training_blueprint
 from avp_sb3.rerun.room import log_room
 
-DEFAULT_FOLDER = Path("runs")
+_FLUSH_S = 5.0
+_LEAST_FREE = 100_000_000
+_LOOPBACK = "127.0.0.1"
+_FIGURE_ROWS, _FIGURE_SECONDS = 512, 10.0
+_Figures = tuple[dict[str, int], Mapping[str, Any]]
+"""An episode's values of the time lines `episode`, `env_step` and, if it was recorded, `step`; its figures."""
+
+
+class RecordingError(AVPError):
+    """A recording that cannot be written, or a viewer that cannot be started or reached."""
 
 
 class RerunCallback(BaseCallback):
@@ -34,7 +50,7 @@ class RerunCallback(BaseCallback):
 
     An episode of 80 steps with 6 pictures of 240x180 takes about 0.2 MB, a scene 0.5 to 1 MB once, 1,000 episodes'
     figures 0.4 MB (1 MB at five episodes a second: every 10 s some are sent). `max_bytes` bounds the whole file,
-    `max_share` the time. When the disk is full or a viewer goes away, it says so once and the training goes on.
+    `max_share` the time. When the disk is nearly full or a viewer goes away, it says so once and the training goes on.
     """
 
     def __init__(
@@ -54,9 +70,9 @@ class RerunCallback(BaseCallback):
 
         Args:
             path: the file to make; `runs/avp-DATE-TIME.rrd` when omitted. A second `learn()` adds `-2` to the name.
-            live: also show it while it grows: `viewer` opens a window, `web` serves a page to this machine's browsers
-                (its address is printed), both until `close()` or the end of the program; `rerun+http://HOST:PORT/proxy`
-                sends to a viewer that is open (`rerun`), which stays open.
+            live: also show it while it grows: `web` serves a page to this machine's browsers until `close()` or the end
+                of the program (its address is printed); `viewer` opens a window, or uses the one that is open; so does
+                `rerun+http://HOST:PORT/proxy`, of any machine.
             every: record the first finished episode, and the next one when k more have ended (counted over all
                 environments) and `max_share` allows it.
             pictures: RGB and depth pictures per episode at most, spread over its steps; 0 for none.
@@ -70,56 +86,54 @@ class RerunCallback(BaseCallback):
             UsageError: an option that cannot be right.
         """
         super().__init__(verbose)
-        for name, value, least in (
-            ("every", every, 1),
-            ("pictures", pictures, 0),
-            ("width", width, 1),
-            ("height", height, 1),
-            ("max_bytes", max_bytes, 1),
-        ):
-            if value < least:
-                raise UsageError(f"RerunCallback {name}: expected at least {least}, got {value}")
+        least = {"every": 1, "pictures": 0, "width": 1, "height": 1, "max_bytes": 1}
+        for name, value in zip(least, (every, pictures, width, height, max_bytes), strict=True):
+            if value < least[name]:
+                raise UsageError(f"RerunCallback {name}: expected at least {least[name]}, got {value}")
         if not 0 < max_share <= 1:
             raise UsageError(f"RerunCallback max_share: expected a number within (0, 1], got {max_share}")
+        if not (live in (None, "viewer", "web") or (live.startswith("rerun+http://") and live.endswith("/proxy"))):
+            raise UsageError(f"live: expected 'viewer', 'web' or 'rerun+http://HOST:PORT/proxy', got {live!r}")
         self.path: Path | None = None
         self._wanted_path = None if path is None else Path(path)
         self._every, self._pictures, self._max_bytes, self._max_share = every, pictures, max_bytes, max_share
-        self._size = (width, height)
-        self._live = None if live is None else LiveViewer(live)
-        self._file: RecordingFile | None = None
+        self._size, self._live = (width, height), live
         self._trainings = 0
+        self._recordings: dict[str, rr.RecordingStream] = {}
+        self._failed: list[rr.RecordingStream] = []
 
     def close(self) -> None:
-        """Finish the file, as the end of `learn()` does, and stop a viewer or server that `live` has started."""
+        """Finish the file, as the end of `learn()` does, and stop the server of `live="web"`."""
+        atexit.unregister(self.close)
         self._finish()
-        if self._live is not None:
-            self._live.close()
+        while self._recordings:
+            self._recordings.popitem()[1].disconnect()
 
     def _on_training_start(self) -> None:
-        self._finish()
+        self.close()
         self._trainings += 1
         self._episodes = self._steps = self._largest = 0
         self._due, self._started, self._spent = 1, time.monotonic(), 0.0
         self._environments = RecordedEnvironments(self.training_env)
-        self._figures = EpisodeFigures()
+        self._kept, self._sent_at = list[_Figures](), time.monotonic()
         self._said: set[str] = set()
         self._shown: set[str] = set()
-        names = self._environments.scenes
-        self._roots = {name: _root(name) if len(names) > 1 else "" for name in names}
         areas = self._environments.areas
-        self._eyes = {self._roots[name]: eye_above(area.centres) for name, area in areas.items()}
-        self._file = new_recording_file(self._next_path(), self._blueprint())
-        self.path = self._file.path
+        self._roots = {name: f"/{rr.escape_entity_path_part(name)}" if len(areas) > 1 else "" for name in areas}
+        eyes = {self._roots[name]: None if area is None else eye_above(area.centres) for name, area in areas.items()}
+        self.path = self._next_path()
+        # By default a process has one id, under which a viewer would merge the recordings of two trainings.
+        identity, layout = str(uuid4()), training_blueprint(eyes)
+        self._recordings[str(self.path)] = _recording_in(self.path, identity, layout)
         # An interrupted training has no end that would finish the file.
-        atexit.register(self._finish)
+        atexit.register(self.close)
         if self.verbose > 1:
             print(f"Rerun:    {self.path}", flush=True)
         if self._live is not None:
-            self._live.open(self._file.recording_id, self._blueprint())
-        if missing := self._environments.missing:
-            lost = {"area": "floor and room", "capture": "pictures and room"}
-            for name in missing:
-                self._say(f"the environment has no {name!r}: recording without {lost[name]}")
+            self._recordings[self._live] = _live_recording(self._live, identity, layout)
+        lost = {"area": "floor and room", "capture": "pictures and room"}
+        for name in self._environments.missing:
+            self._say(f"the environment has no {name!r}: recording without {lost[name]}")
 
     def _on_step(self) -> bool:
         for index, info in finished_episodes(self.locals):
@@ -127,13 +141,12 @@ class RerunCallback(BaseCallback):
             if "avp_episode" not in info:
                 self._say("no 'avp_episode' in info at the end of an episode: recording without figures")
             trajectory = required(info, "avp_trajectory", reader="RerunCallback")
-            last_step = None
+            times = {"episode": self._episodes, "env_step": self.num_timesteps}
             if self._is_due():
-                last_step = self._timed_record(index, trajectory)
-            self._figures.add(
-                info.get("avp_episode", {}), episode=self._episodes, env_step=self.num_timesteps, step=last_step
-            )
-            if self._figures.due:
+                self._record(index, trajectory, times)
+                times["step"] = self._steps - 1
+            self._kept.append((times, info.get("avp_episode", {})))
+            if len(self._kept) >= _FIGURE_ROWS or time.monotonic() - self._sent_at > _FIGURE_SECONDS:
                 self._send_figures()
         return True
 
@@ -141,18 +154,14 @@ class RerunCallback(BaseCallback):
         self._finish()
 
     def _finish(self) -> None:
-        """Send what is kept, and end the recording; a viewer stays."""
-        if self._file is None:
+        """Send what is kept and end the file; a viewer stays."""
+        if not self._recordings:
             return
-        atexit.unregister(self._finish)
         self._send_figures()
-        self._file.close()
-        self._check_file()
-        if self._live is not None:
-            self._live.finish()
-        self._file = None
-        if self.verbose:
-            print(f"Rerun:    rerun {shlex.quote(str(self.path))}", flush=True)
+        if recording := self._recordings.pop(str(self.path), None):
+            recording.disconnect()
+            if self.verbose:
+                print(f"Rerun:    rerun {shlex.quote(str(self.path))}", flush=True)
 
     def _is_due(self) -> bool:
         if self._episodes < self._due:
@@ -160,80 +169,59 @@ class RerunCallback(BaseCallback):
         in_time = self._spent <= self._max_share * (time.monotonic() - self._started)
         return in_time and self._has_room(self._largest)
 
-    def _timed_record(self, index: int, trajectory: Any) -> int:
-        """Record an episode; the step of its last view."""
-        assert self._file is not None
-        began, size = time.monotonic(), self._file.size
-        self._record(index, trajectory)
-        self._largest = max(self._largest, self._file.size - size)
-        self._spent += time.monotonic() - began
-        self._due = self._episodes + self._every
-        return self._steps - 1
-
-    def _record(self, index: int, trajectory: Any) -> None:
-        assert self._file is not None
+    def _record(self, index: int, trajectory: Any, times: Mapping[str, int]) -> None:
+        began, size = time.monotonic(), self._file_size
         width, height = self._size
         camera = self._environments.camera(index, width=width, height=height)
         views = self._environments.pictures(index, trajectory, camera, at_most=self._pictures)
         episode = episode_of(trajectory, self._environments.area(index), camera, views)
-        root = self._root(self._environments.scene(index))
+        root = self._roots.get(self._environments.scene(index), "")
         is_new = root not in self._shown
         room = self._environments.room(index) if is_new else None
-        if room is not None and not self._has_room(room[0].nbytes + room[1].nbytes):
+        if room is not None and not self._has_room(sum(array.nbytes for array in room)):
             room = None
         self._shown.add(root)
-        for recording in self._recordings():
+        for recording in self._recordings.values():
             if room is not None:
-                log_room(recording, f"{root}/world/room", *room)
-            log_episode(
-                recording,
-                root,
-                episode,
-                number=self._episodes,
-                first_step=self._steps,
-                env_step=self.num_timesteps,
-                with_scene=is_new,
-            )
+                log_room(recording, f"{root}/world/room", room)
+            log_episode(recording, root, episode, times=times, first_step=self._steps, with_scene=is_new)
+        self._flush()
         self._steps += len(trajectory.action)
-        self._file.flush()
-        self._check_file()
+        self._largest = max(self._largest, self._file_size - size)
+        self._spent += time.monotonic() - began
+        self._due = self._episodes + self._every
 
     def _send_figures(self) -> None:
-        assert self._file is not None
-        if self._has_room(self._figures.size):
-            self._figures.send(self._recordings())
-        self._file.flush()
-        self._check_file()
+        curves = list(_curves(self._kept)) if self._has_room() else []
+        for recording in self._recordings.values():
+            for path, times, values in curves:
+                recording.send_columns(path, times, rr.Scalars.columns(scalars=values))
+        self._kept, self._sent_at = [], time.monotonic()
+        self._flush()
 
-    def _recordings(self) -> list[rr.RecordingStream]:
-        """Those that still take something."""
-        assert self._file is not None
-        streams = [self._file.recording] if self._file.fault is None else []
-        if self._live is not None and (stream := self._live.recording) is not None:
-            streams.append(stream)
-        return streams
+    def _flush(self) -> None:
+        """Let what was logged reach the file and the viewer; nothing further goes where it cannot."""
+        for name, recording in list(self._recordings.items()):
+            try:
+                recording.flush(timeout_sec=_FLUSH_S)
+            except RuntimeError as error:
+                # Kept, because Rerun waits without end when it lets go of a file that could not be written.
+                self._failed.append(self._recordings.pop(name))
+                self._say(f"{name}: {error}; what came before is kept, the training goes on")
 
-    def _root(self, scene: str) -> str:
-        """The entity path of a scene; a scene that was not there at the start gets a place in the layout."""
-        if scene not in self._roots:
-            self._roots[scene] = _root(scene)
-            for recording in self._recordings():
-                recording.send_blueprint(self._blueprint())
-        return self._roots[scene]
-
-    def _blueprint(self) -> rr.blueprint.Blueprint:
-        return blueprint(list(self._roots.values()), with_metrics=True, eyes=self._eyes)
-
-    def _check_file(self) -> None:
-        if self._file is not None and (fault := self._file.fault) is not None:
-            self._say(f"{self._file.path}: {fault.strerror or fault}; what came before is kept, the training goes on")
-
-    def _has_room(self, size: int) -> bool:
-        assert self._file is not None
-        if self._file.size + size < self._max_bytes:
+    def _has_room(self, size: int = 0) -> bool:
+        assert self.path is not None
+        if self._file_size + size >= self._max_bytes:
+            self._say(f"{self.path}: has reached max_bytes ({self._max_bytes}); nothing further is recorded")
+        elif shutil.disk_usage(self.path.parent).free < size + _LEAST_FREE:
+            self._say(f"{self.path}: the disk has less than {_LEAST_FREE / 1e6:.0f} MB left; nothing is recorded")
+        else:
             return True
-        self._say(f"{self._file.path}: has reached max_bytes ({self._max_bytes}); nothing further is recorded")
         return False
+
+    @property
+    def _file_size(self) -> int:
+        return self.path.stat().st_size if self.path is not None and self.path.exists() else 0
 
     def _say(self, text: str) -> None:
         """A line on the error stream, once per training."""
@@ -242,11 +230,65 @@ class RerunCallback(BaseCallback):
             print(f"RerunCallback: {text}", file=sys.stderr)
 
     def _next_path(self) -> Path:
-        path = self._wanted_path or DEFAULT_FOLDER / f"avp-{datetime.now():%Y%m%d-%H%M%S}.rrd"
+        path = self._wanted_path or Path("runs") / f"avp-{datetime.now():%Y%m%d-%H%M%S}.rrd"
         if self._trainings > 1 and self._wanted_path is not None:
             path = path.with_stem(f"{path.stem}-{self._trainings}")
         return path
 
 
-def _root(scene: str) -> str:
-    return f"/{rr.escape_entity_path_part(scene)}"
+def _curves(kept: list[_Figures]) -> Iterator[tuple[str, list[rr.TimeColumn], list[float]]]:
+    """Entity, times and values of each figure, apart for the episodes that have a `step` and those that have none."""
+    for lines in dict.fromkeys(tuple(times) for times, _ in kept):
+        rows = [(times, figures) for times, figures in kept if tuple(times) == lines]
+        values = [item for _, figures in rows for item in figures.items()]
+        for name in dict.fromkeys(name for name, value in values if isinstance(value, Real)):
+            having = [(times, figures[name]) for times, figures in rows if name in figures]
+            columns = [rr.TimeColumn(line, sequence=[times[line] for times, _ in having]) for line in lines]
+            yield metric_path("", name), columns, [value for _, value in having]
+
+
+def _recording_in(path: Path, identity: str, layout: rr.blueprint.Blueprint) -> rr.RecordingStream:
+    """A recording in a file that did not exist, in a folder that is made if need be."""
+    check_new(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()  # Rerun's own error for an unwritable path does not say why.
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot write the recording there: {error.strerror or error}") from None
+    recording = rr.RecordingStream(APPLICATION, recording_id=identity)
+    recording.save(path, default_blueprint=layout)
+    return recording
+
+
+def _live_recording(target: str, identity: str, layout: rr.blueprint.Blueprint) -> rr.RecordingStream:
+    """A recording in a viewer, which is started if need be."""
+    recording = rr.RecordingStream(APPLICATION, recording_id=identity)
+    try:
+        if target == "web":
+            data = rr.GrpcServerSink(_LOOPBACK, _free_port())
+            recording.set_sinks(data, default_blueprint=layout)
+            print(f"Rerun web viewer: {_web_page()}/?url={quote(data.uri, safe='')}", flush=True)
+        elif target == "viewer":
+            program = Path(sysconfig.get_path("scripts")) / "rerun"
+            rr.spawn(recording=recording, default_blueprint=layout, executable_path=str(program))
+        else:
+            recording.connect_grpc(target, default_blueprint=layout)
+        recording.flush(timeout_sec=_FLUSH_S)
+    except (RuntimeError, ValueError) as error:
+        hint = "; live='web' needs no display" if target == "viewer" else "; is a viewer open there (`rerun`)?"
+        raise RecordingError(f"live={target!r}: no Rerun viewer there ({error}){hint}") from None
+    return recording
+
+
+@functools.cache
+def _web_page() -> str:
+    """The address of the viewer's page, which is served until the end of the program."""
+    port = _free_port()
+    rr.serve_web_viewer(web_port=port, open_browser=False)
+    return f"http://{_LOOPBACK}:{port}"
+
+
+def _free_port() -> int:
+    with socket.socket() as candidate:
+        candidate.bind((_LOOPBACK, 0))
+        return candidate.getsockname()[1]

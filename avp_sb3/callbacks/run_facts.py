@@ -9,6 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from avp_habitat.provenance import flat
+from avp_habitat.task.settings import TaskSettings
 
 _NOT_HYPERPARAMETERS = {"self", "env", "policy", "verbose", "tensorboard_log", "_init_setup_model"}
 
@@ -35,7 +36,7 @@ def task_settings(env: VecEnv) -> dict[str, Any]:
     facts: dict[str, Any] = {}
     settings = env.get_attr("settings", 0)[0] if env.has_attr("settings") else None
     if dataclasses.is_dataclass(settings) and not isinstance(settings, type):
-        facts |= dataclasses.asdict(settings)
+        facts |= settings.facts() if isinstance(settings, TaskSettings) else dataclasses.asdict(settings)
     spec = env.get_attr("spec", 0)[0] if env.has_attr("spec") else None
     if spec is not None:
         facts["id"] = spec.id
@@ -48,10 +49,9 @@ def run_name(model: BaseAlgorithm, env: VecEnv) -> str:
     MLflow would draw a name at random, the same one after each training with the same seed.
     """
     task, scenes = task_settings(env), _each_once(env, "scene_name")
-    where = scenes[0] if scenes else task.get("env.id")
-    more = f"and {len(scenes) - 1} more" if len(scenes) > 1 else None
-    seed = None if model.seed is None else f"seed {model.seed}"
-    words = (type(model).__name__.lower(), task.get("env.reward"), where, more, seed)
+    words = [type(model).__name__.lower(), task.get("env.reward"), scenes[0] if scenes else task.get("env.id")]
+    words += [f"and {len(scenes) - 1} more"] if len(scenes) > 1 else []
+    words += [] if model.seed is None else [f"seed {model.seed}"]
     return " ".join(str(word) for word in words if word is not None)
 
 
@@ -70,16 +70,10 @@ def _plain(value: Any) -> Any:
     """A value whose text says what it is, without memory addresses."""
     if isinstance(value, Mapping):
         return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, type):
-        return value.__name__
-    if callable(value):
-        return _schedule(value)
-    return value
-
-
-def _schedule(schedule: Any) -> Any:
+    if isinstance(value, type) or not callable(value):
+        return getattr(value, "__name__", value)
     try:
-        start, end = float(schedule(1.0)), float(schedule(0.0))
+        start, end = float(value(1.0)), float(value(0.0))
     except (TypeError, ValueError):
-        return getattr(schedule, "__name__", type(schedule).__name__)
+        return getattr(value, "__name__", type(value).__name__)
     return start if start == end else f"{start:g} -> {end:g}"

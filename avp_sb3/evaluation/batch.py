@@ -1,102 +1,62 @@
 """Episodes of a model that still trains, run side by side in a vector environment of their own."""
 
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from copy import deepcopy
+from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.vec_env import VecEnv
-
-from avp_habitat.simulators.registry import ONE_PER_PROCESS, SimulatorChoice
-from avp_habitat.task.settings import TaskSettings
-from avp_sb3.vec_env.batched import AVPVecEnv
-from avp_sb3.vec_env.subproc import AVPSubprocVecEnv
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.base_class import BaseAlgorithm
-from collections.abc import Mapping
-from dataclasses import dataclass
-
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from avp_habitat.errors import UsageError
 from avp_habitat.metrics import coverage_per_view
-from avp_habitat.task.trajectory import Trajectory
+from avp_habitat.task.settings import TaskSettings
 from avp_habitat.tracking.names import safe_name
 from avp_sb3.callbacks.base import required
-from avp_sb3.evaluation.fit import normaliser
-from avp_sb3.evaluation.policy import COVERAGE_AFTER, KEPT, episode_figures
+from avp_sb3.evaluation.policy import Episode, episode_of
+
+READER = "EvaluationCallback"
+"""Who needs what an environment reports, for the errors' texts."""
 
 
-class FixedStarts(AVPVecEnv):
-    """One agent for each episode in each of some scenes; seeded, episode i of every scene starts from `seed + i`."""
-
-    def __init__(self, scenes: Sequence[str], *, episodes: int, **options: Any) -> None:
-        """Open the scenes.
-
-        Args:
-            scenes: each as `avp_habitat.scenes.location.locate` takes it.
-            episodes: in each scene.
-            **options: of `AVPVecEnv`.
-
-        Raises:
-            AVPError: as `AVPVecEnv`.
-        """
-        super().__init__(list(scenes), agents=episodes * len(scenes), **options)
-
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed the starts of the next `reset`."""
-        if seed is not None:
-            self._seeds = _starts(seed, self.num_envs, len(self.simulators))
-        return self._seeds
-
-
-class FixedStartsInProcesses(AVPSubprocVecEnv):
-    """The same with a process for each scene, whatever simulator this process itself holds."""
-
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed the starts of the next `reset`."""
-        if seed is not None:
-            self._seeds = _starts(seed, self.num_envs, len(self.scenes))
-        return self._seeds
-
-
-def fixed_starts(scenes: Sequence[str], choice: SimulatorChoice, *, episodes: int, settings: TaskSettings) -> VecEnv:
-    """The scenes in this process, or each in its own where a process can hold one simulator only.
+def check_fit(model: BaseAlgorithm, training: VecEnv, env: VecEnv) -> None:
+    """Refuse an evaluation's environment that the policy cannot act in.
 
     Args:
-        scenes: as the simulator takes them.
-        choice: of the simulator.
-        episodes: in each scene.
-        settings: of the task.
+        model: that trains.
+        training: its environment.
+        env: of the evaluation.
 
     Raises:
-        AVPError: as `AVPVecEnv` and `AVPSubprocVecEnv`.
+        UsageError: the spaces differ, only the evaluation is normalised, or it is the training's own environment.
     """
-    options = {"simulator": choice.simulator, "gpu": choice.gpu, "navmesh": choice.navmesh, "up": choice.up}
-    if choice.simulator not in ONE_PER_PROCESS:
-        return FixedStarts(scenes, episodes=episodes, settings=settings, **options)
-    return FixedStartsInProcesses(list(scenes), agents=episodes * len(scenes), settings=settings, **options)
-
-
-def _starts(seed: int, agents: int, scenes: int) -> list[int | None]:
-    """Agent i is in scene i modulo their number."""
-    return [seed + row // scenes for row in range(agents)]
+    if training.unwrapped is env.unwrapped:
+        raise UsageError(f"{READER} eval_env: is the training's own environment; expected another one")
+    normalised, own = model.get_vec_normalize_env(), unwrap_vec_normalize(env)
+    if own is not None and normalised is None:
+        raise UsageError(f"{READER} eval_env: is wrapped in VecNormalize, but the training's environment is not")
+    seen = model.observation_space if own is not None or normalised is None else normalised.venv.observation_space
+    for kind, expected in (("observation_space", seen), ("action_space", model.action_space)):
+        if expected != getattr(env, kind):
+            raise UsageError(
+                f"{READER}: expected the {kind} of the policy, {expected}, but the evaluation's environment has "
+                f"{getattr(env, kind)}; wrap an eval_env as the training's environment is wrapped"
+            )
 
 
 @contextmanager
-def own_random_state(model: "BaseAlgorithm", seed: int) -> Iterator[None]:
+def own_random_state(model: BaseAlgorithm, seed: int) -> Iterator[None]:
     """Within the block, all generators that `model.predict` may use start from `seed`; after it they are as before.
 
     These are Python's, NumPy's and torch's global ones and that of the model's action space. The policy's training mode
     is given back, too.
     """
-    space = model.action_space.np_random
-    python, numpy_, mode = random.getstate(), np.random.get_state(), model.policy.training
-    drawn = space.bit_generator.state
+    drawing = model.action_space.np_random.bit_generator
+    before = random.getstate(), np.random.get_state(), drawing.state, model.policy.training
     on_gpu = model.device.type == "cuda"
     with torch.random.fork_rng([model.device] if on_gpu else []):
         try:
@@ -105,35 +65,13 @@ def own_random_state(model: "BaseAlgorithm", seed: int) -> Iterator[None]:
             torch.default_generator.manual_seed(seed)
             if on_gpu:
                 torch.cuda.manual_seed(seed)
-            space.bit_generator.state = np.random.default_rng(seed).bit_generator.state
+            drawing.state = np.random.default_rng(seed).bit_generator.state
             yield
         finally:
-            model.policy.set_training_mode(mode)
-            space.bit_generator.state = drawn
-            np.random.set_state(numpy_)
-            random.setstate(python)
-
-
-READER = "EvaluationCallback"
-"""Who needs what an environment reports, for the errors' texts."""
-_OF_BUDGET = ("coverage_area", *(f"coverage_at_{views}" for views in COVERAGE_AFTER))
-FIGURES = (*KEPT, "redundant_share", "return", "cpv", *_OF_BUDGET)
-"""Everything that an evaluation may log, below `eval/`."""
-
-
-@dataclass(frozen=True)
-class BatchEpisode:
-    """One episode."""
-
-    agent: int
-    """Number of its environment."""
-    curve: NDArray[np.float64]
-    """`(v,)` coverage after each view, within [0, 1], held up to the budget where there is one; the last one alone
-    where the environment tells no other."""
-    figures: dict[str, float]
-    """As `EpisodeResult.figures`, and `return`; without those of the whole curve where budget or curve are not told."""
-    trajectory: Trajectory | None
-    """What the agent did, where the environment tells."""
+            random.setstate(before[0])
+            np.random.set_state(before[1])
+            drawing.state = before[2]
+            model.policy.set_training_mode(before[3])
 
 
 def scenes_of(env: VecEnv) -> dict[str, list[int]]:
@@ -150,87 +88,94 @@ def scenes_of(env: VecEnv) -> dict[str, list[int]]:
     for agent, scene in enumerate(zip(names, digests, strict=True)):
         if scene not in labels:
             label = safe_name(str(scene[0]).replace("/", "_")).replace(" ", "_")
-            labels[scene] = _not_in(label, found)
+            numbered = [label, *(f"{label}-{number}" for number in range(2, len(found) + 2))]
+            labels[scene] = next(name for name in numbered if name not in found)
         found.setdefault(labels[scene], []).append(agent)
     return found
 
 
-def _not_in(label: str, taken: Mapping[str, Any]) -> str:
-    numbered = [label, *(f"{label}-{number}" for number in range(2, len(taken) + 2))]
-    return next(name for name in numbered if name not in taken)
-
-
-def budget_of(env: VecEnv) -> int | None:
-    """Views that an episode may have, if the environment tells."""
-    settings = env.get_attr("settings", 0)[0] if env.has_attr("settings") else None
-    return settings.budget if isinstance(settings, TaskSettings) else None
-
-
 def run_batch(
-    model: BaseAlgorithm, env: VecEnv, episodes: Mapping[int, int], *, seed: int, deterministic: bool
-) -> list[BatchEpisode]:
+    model: BaseAlgorithm, env: VecEnv, episodes: int, *, seed: int, deterministic: bool
+) -> dict[str, list[Episode]]:
     """Run episodes; all environments are stepped by one call, and those that have done theirs are not counted further.
 
     Args:
-        model: whose policy acts; it is asked once for each step. Where the model trains with `VecNormalize` and `env`
-            has none, it sees observations normalised with the training's statistics.
+        model: whose policy acts; it is asked once for each step. Where the model trains with `VecNormalize`, it sees
+            observations normalised with the training's statistics.
         env: seeded and reset here.
-        episodes: how many of each environment, by its number.
-        seed: of the starts.
+        episodes: in each scene, as evenly spread over its environments as can be.
+        seed: the i-th environment of each scene starts from `seed + i`.
         deterministic: False to sample the actions.
 
     Raises:
         MissingInfoError: the environment does not report what is needed.
 
     Returns:
-        The episodes, sorted by environment.
+        The episodes by scene (`scenes_of`), sorted by environment.
     """
-    normalise = normaliser(model, env)
-    budget = budget_of(env)
-    wanted = np.array([episodes.get(agent, 0) for agent in range(env.num_envs)])
-    env.seed(seed)
-    observation, state, starts = normalise(env.reset()), None, np.ones(env.num_envs, dtype=np.bool_)
-    running = [_Running() for _ in range(env.num_envs)]
-    done: list[BatchEpisode] = []
-    while wanted.any():
-        actions, state = model.predict(observation, state, starts, deterministic=deterministic)  # type: ignore[arg-type]
-        observation, rewards, starts, infos = env.step(actions)
-        observation, rewards = normalise(observation), _original(env, rewards)
-        for agent in np.flatnonzero(wanted):
-            running[agent].add(float(rewards[agent]), infos[agent])
-            if starts[agent]:
-                done.append(running[agent].finished(int(agent), infos[agent], budget))
-                running[agent], wanted[agent] = _Running(), wanted[agent] - 1
-    return sorted(done, key=lambda episode: episode.agent)
+    scenes = scenes_of(env)
+    wanted, seeds = np.zeros(env.num_envs, dtype=np.int64), [0] * env.num_envs
+    for agents in scenes.values():
+        for place, agent in enumerate(agents):
+            wanted[agent] = (episodes + len(agents) - 1 - place) // len(agents)
+            seeds[agent] = seed + place
+    settings = env.get_attr("settings", 0)[0] if env.has_attr("settings") else None
+    budget = settings.budget if isinstance(settings, TaskSettings) else None
+    done: dict[int, list[Episode]] = {agent: [] for agent in range(env.num_envs)}
+    coverage: list[list[float]] = [[] for _ in done]
+    returned = np.zeros(env.num_envs)
+    with _normalised(model, env) as normalise:
+        env.seed(seed)
+        env.unwrapped._seeds = seeds  # Other starts than seed, seed + 1, … over all scenes.
+        observation, state, starts = normalise(env.reset()), None, np.ones(env.num_envs, dtype=np.bool_)
+        while wanted.any():
+            actions, state = model.predict(observation, state, starts, deterministic=deterministic)  # type: ignore[arg-type]
+            observation, rewards, starts, infos = env.step(actions)
+            observation = normalise(observation)
+            returned += _original(env, rewards)
+            for agent in np.flatnonzero(wanted):
+                if "coverage" in infos[agent]:
+                    coverage[agent].append(float(infos[agent]["coverage"]))
+                if starts[agent]:
+                    done[agent].append(_finished(coverage[agent], infos[agent], budget, float(returned[agent])))
+                    coverage[agent], returned[agent], wanted[agent] = [], 0.0, wanted[agent] - 1
+    return {scene: [episode for agent in agents for episode in done[agent]] for scene, agents in scenes.items()}
 
 
-class _Running:
-    """What is known of an episode before it ends."""
-
-    def __init__(self) -> None:
-        self.coverage: list[float] = []
-        self.reward = 0.0
-
-    def add(self, reward: float, info: Mapping[str, Any]) -> None:
-        if "coverage" in info:
-            self.coverage.append(float(info["coverage"]))
-        self.reward += reward
-
-    def finished(self, agent: int, info: Mapping[str, Any], budget: int | None) -> BatchEpisode:
-        told = required(info, "avp_episode", reader=READER)
-        for key in (*KEPT, "redundant_views"):
-            required(told, key, reader=READER, inside="info['avp_episode']")
-        curve, figures = episode_figures(self.coverage or [told["coverage"]], told, budget or len(self.coverage) or 1)
-        if budget is None or not self.coverage:
-            figures = {name: value for name, value in figures.items() if name not in _OF_BUDGET}
-        return BatchEpisode(agent, curve, figures | {"return": self.reward}, info.get("avp_trajectory"))
+def _finished(coverage: list[float], info: dict[str, Any], budget: int | None, returned: float) -> Episode:
+    told = required(info, "avp_episode", reader=READER)
+    for key in ("coverage", "views"):
+        required(told, key, reader=READER, inside="info['avp_episode']")
+    episode = episode_of(coverage, info, budget)
+    episode.figures["return"] = returned
+    return episode
 
 
-def means(episodes: Sequence[BatchEpisode]) -> dict[str, float]:
+def means(episodes: list[Episode]) -> dict[str, float]:
     """Mean of each figure over at least one episode, and CpV of all of them."""
-    mean = {name: float(np.mean([episode.figures[name] for episode in episodes])) for name in episodes[0].figures}
-    coverages, lengths = (np.array([each.figures[name] for each in episodes]) for name in ("coverage", "views"))
-    return mean | {"cpv": coverage_per_view(coverages, lengths)}
+    columns = {name: np.array([each.figures[name] for each in episodes]) for name in episodes[0].figures}
+    cpv = coverage_per_view(columns["coverage"], columns["views"])
+    return {name: float(values.mean()) for name, values in columns.items()} | {"cpv": cpv}
+
+
+@contextmanager
+def _normalised(model: BaseAlgorithm, env: VecEnv) -> Iterator[Callable[[Any], Any]]:
+    """A block with what turns the environment's observations into those that the policy knows.
+
+    Its own `VecNormalize` uses the training's statistics in the block, unchanged.
+    """
+    theirs, ours = model.get_vec_normalize_env(), unwrap_vec_normalize(env)
+    if theirs is None or ours is None:
+        yield (lambda observation: observation) if theirs is None else theirs.normalize_obs
+        return
+    if theirs.norm_obs:
+        ours.obs_rms = deepcopy(theirs.obs_rms)
+    ours.ret_rms = deepcopy(theirs.ret_rms)
+    before, ours.training = ours.training, False
+    try:
+        yield lambda observation: observation
+    finally:
+        ours.training = before
 
 
 def _original(env: VecEnv, rewards: NDArray) -> NDArray:

@@ -4,79 +4,55 @@ import csv
 import json
 import os
 import platform
-import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from avp_habitat.errors import AVPError, UsageError
-from avp_habitat.metrics import coverage_per_view, explained
+from avp_habitat import tables
+from avp_habitat.errors import AVPError
+from avp_habitat.files import atomic_folder
+from avp_habitat.metrics import CONFIDENCE, Figure, coverage_per_view, explained, mean_and_half_width
 from avp_habitat.provenance import git_commit, installed_versions
-from avp_sb3.evaluation.policy import CONFIDENCE, PolicyResult, mean_and_half_width
+from avp_sb3.evaluation.policy import PolicyResult, figures_of
 
 JSON_FILE, CSV_FILE, TABLE_FILE, PLOT_FILE = "evaluation.json", "episodes.csv", "table.md", "coverage.png"
 FORMAT, FORMAT_VERSION = "avp-evaluation", 1
+LEGEND = f"{explained('coverage', 'ANND', 'EI', 'CpV', 'redundant views', 'stop')}; ±: half of the 95 % interval"
+"""One line to print below a table."""
 _VERSIONED = ("avp-suite", "stable-baselines3", "torch", "gymnasium", "numpy", "open3d", "scipy")
-_MACHINE = f"{platform.machine()}, {os.cpu_count()} cores"
 
 
 class ReportError(AVPError):
     """A report that cannot be written or read."""
 
 
-@dataclass(frozen=True)
-class _Figure:
-    """How a figure is shown."""
+def table(results: Sequence[PolicyResult], metrics: Iterable[Any] = ()) -> str:
+    """Figures by policy as a Markdown table: mean ± half the 95 % confidence interval; no ± for one episode.
 
-    title: str
-    """With its unit."""
-    scale: float = 1.0
-    """The shown number by the figure's own."""
-    digits: int = 1
-    """After the point."""
-
-
-_SHOWN = {
-    "coverage": _Figure("coverage [%]", 100),
-    "coverage_at_20": _Figure("coverage at 20 views [%]", 100),
-    "coverage_at_40": _Figure("coverage at 40 views [%]", 100),
-    "coverage_at_60": _Figure("coverage at 60 views [%]", 100),
-    "coverage_at_80": _Figure("coverage at 80 views [%]", 100),
-    "coverage_area": _Figure("coverage, mean over views [%]", 100),
-    "views": _Figure("views"),
-    "stopped": _Figure("ended by a stop [%]", 100),
-    "annd_m": _Figure("ANND [m]", digits=3),
-    "ei": _Figure("EI [%/view]", 100, 2),
-    "path_length_m": _Figure("path length [m]", digits=2),
-    "collisions": _Figure("collisions"),
-    "redundant_share": _Figure("redundant views [%]", 100),
-}
-
-LEGEND = f"{explained('coverage', 'ANND', 'EI', 'CpV', 'redundant views', 'stop')}; ±: half of the 95 % interval"
-"""One line to print below a table."""
+    Args:
+        results: of at least one policy.
+        metrics: of the user, as `TaskSettings.metrics`, that say how their figures are shown.
+    """
+    head = ["figure", *(result.policy for result in results)]
+    return tables.table(head, [[name, *row] for name, row in cells(results, metrics).items()])
 
 
-def table(results: Sequence[PolicyResult]) -> str:
-    """Figures by policy as a Markdown table: mean ± half the 95 % confidence interval; no ± for one episode."""
-    rows = [["figure", *(result.policy for result in results)], *([name, *row] for name, row in cells(results).items())]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    padded = [[cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in rows]
-    padded.insert(1, ["-" * width for width in widths])
-    return "\n".join(f"| {' | '.join(row)} |" for row in padded)
-
-
-def cells(results: Sequence[PolicyResult]) -> dict[str, list[str]]:
-    """By the title of a figure, its text for each policy."""
-    names = [name for name in _SHOWN if name in results[0].figures]
+def cells(results: Sequence[PolicyResult], metrics: Iterable[Any] = ()) -> dict[str, list[str]]:
+    """By the heading of a figure, its text for each policy; arguments as of `table`."""
+    present = results[0].figures
+    known = figures_of(metrics)
+    # Whoever reads a report may not have the metrics that its figures are of.
+    known |= {name: Figure(name, name, digits=3) for name in present if name not in known}
     shown = {
-        _SHOWN[name].title: [_cell(_SHOWN[name], *mean_and_half_width(result.figures[name])) for result in results]
-        for name in names
+        figure.heading: [figure.text(*map(float, mean_and_half_width(each.figures[name]))) for each in results]
+        for name, figure in known.items()
+        if name in present
     }
+    ratio = known["cpv"]
     episodes = [str(len(result.seeds)) for result in results]
-    return shown | {"CpV [%/view]": [f"{cpv(result):.2f}" for result in results], "episodes": episodes}
+    return shown | {ratio.heading: [ratio.text(cpv(result)) for result in results], "episodes": episodes}
 
 
 def cpv(result: PolicyResult) -> float:
@@ -84,41 +60,43 @@ def cpv(result: PolicyResult) -> float:
     return coverage_per_view(result.figures["coverage"], result.figures["views"])
 
 
-def check_new(folder: Path) -> None:
-    """Refuse a folder that exists.
-
-    Raises:
-        UsageError: it does.
-    """
-    if folder.exists() or folder.is_symlink():
-        raise UsageError(f"--out {folder}: exists already; choose another name or remove it")
+def summary(result: PolicyResult) -> dict[str, dict[str, float | None]]:
+    """Mean and half the 95 % confidence interval by figure; None where one episode tells nothing of the spread."""
+    values = {name: mean_and_half_width(figures) for name, figures in result.figures.items()}
+    return {name: {"mean": _number(mean), "half_width": _number(half)} for name, (mean, half) in values.items()}
 
 
-def write_report(folder: Path, results: Sequence[PolicyResult], about: Mapping[str, Any]) -> Path:
+def write_report(
+    folder: Path, results: Sequence[PolicyResult], about: Mapping[str, Any], metrics: Iterable[Any] = ()
+) -> Path:
     """Write the folder; it appears only when it is whole.
 
     Args:
         folder: must not exist.
         results: of at least one policy.
         about: what was evaluated (command, scene, settings, …), as JSON; machine, commit and versions are added.
+        metrics: as of `table`.
 
     Raises:
         UsageError: the folder exists.
         ReportError: it cannot be written.
     """
-    check_new(folder)
-    temporary = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
-    try:
-        temporary.mkdir(parents=True)
-        (temporary / JSON_FILE).write_text(_json(results, about), encoding="utf-8")
-        (temporary / TABLE_FILE).write_text(f"{table(results)}\n\n{LEGEND}\n", encoding="utf-8")
-        _write_csv(temporary / CSV_FILE, results)
-        _plot(temporary / PLOT_FILE, results)
-        temporary.rename(folder)
-    except OSError as error:
-        raise ReportError(f"--out {folder}: cannot write there: {error.strerror or error}") from None
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    value = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        **about,
+        "confidence": CONFIDENCE,
+        "commit": git_commit(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "versions": installed_versions(_VERSIONED),
+        "policies": [_entry(result) for result in results],
+    }
+    with atomic_folder(folder, failure=ReportError, option="--out") as made:
+        text = json.dumps(value, indent=2, allow_nan=False)
+        (made / JSON_FILE).write_text(f"{text}\n", encoding="utf-8")
+        (made / TABLE_FILE).write_text(f"{table(results, metrics)}\n\n{LEGEND}\n", encoding="utf-8")
+        _write_csv(made / CSV_FILE, results)
+        _plot(made / PLOT_FILE, results)
     return folder
 
 
@@ -142,33 +120,9 @@ def read_report(folder: str | Path) -> list[PolicyResult]:
     return [_result(entry) for entry in value["policies"]]
 
 
-def summary(result: PolicyResult) -> dict[str, dict[str, float | None]]:
-    """Mean and half the 95 % confidence interval by figure; None where one episode tells nothing of the spread."""
-    values = {name: mean_and_half_width(figures) for name, figures in result.figures.items()}
-    return {name: {"mean": float(mean), "half_width": _number(half)} for name, (mean, half) in values.items()}
-
-
-def _cell(figure: _Figure, mean: Any, half: Any) -> str:
-    text = f"{figure.scale * mean:.{figure.digits}f}"
-    return text if np.isnan(half) else f"{text} ± {figure.scale * half:.{figure.digits}f}"
-
-
 def _number(value: Any) -> float | None:
+    """As JSON has it, which knows no nan."""
     return float(value) if np.isfinite(value) else None
-
-
-def _json(results: Sequence[PolicyResult], about: Mapping[str, Any]) -> str:
-    value = {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        **about,
-        "confidence": CONFIDENCE,
-        "commit": git_commit(),
-        "machine": _MACHINE,
-        "versions": installed_versions(_VERSIONED),
-        "policies": [_entry(result) for result in results],
-    }
-    return json.dumps(value, indent=2, allow_nan=False) + "\n"
 
 
 def _entry(result: PolicyResult) -> dict[str, Any]:
@@ -176,7 +130,7 @@ def _entry(result: PolicyResult) -> dict[str, Any]:
     episodes = [
         {
             "seed": int(seed),
-            **{name: float(values[row]) for name, values in result.figures.items()},
+            **{name: _number(values[row]) for name, values in result.figures.items()},
             "curve": result.curve[row].tolist(),
         }
         for row, seed in enumerate(result.seeds)
@@ -198,7 +152,7 @@ def _result(entry: Mapping[str, Any]) -> PolicyResult:
         policy=entry["policy"],
         seeds=np.array([episode["seed"] for episode in episodes]),
         curve=np.array([episode["curve"] for episode in episodes]),
-        figures={name: np.array([episode[name] for episode in episodes]) for name in names},
+        figures={name: np.array([episode[name] for episode in episodes], dtype=np.float64) for name in names},
         training_run=entry["training_run"],
         observation=entry["observation"],
     )
@@ -215,16 +169,15 @@ def _write_csv(path: Path, results: Sequence[PolicyResult]) -> None:
 
 def _plot(path: Path, results: Sequence[PolicyResult]) -> None:
     """Mean coverage by view with its confidence band."""
-    from matplotlib.figure import Figure
+    from matplotlib import figure
 
-    picture = Figure(figsize=(7, 4.5), layout="constrained")
+    picture = figure.Figure(figsize=(7, 4.5), layout="constrained")
     axes = picture.subplots()
     for result in results:
         mean, half = mean_and_half_width(100 * result.curve)
         views = np.arange(1, len(mean) + 1)
         (line,) = axes.plot(views, mean, label=f"{result.policy} ({len(result.seeds)} episodes)")
-        if not np.isnan(half).any():
-            axes.fill_between(views, mean - half, mean + half, color=line.get_color(), alpha=0.2, linewidth=0)
+        axes.fill_between(views, mean - half, mean + half, color=line.get_color(), alpha=0.2, linewidth=0)
     axes.set(xlabel="views", ylabel="coverage [%]", ylim=(0, 100), xlim=(1, None))
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right", title="mean, 95 % confidence of the mean")

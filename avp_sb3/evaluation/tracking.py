@@ -3,7 +3,7 @@
 import os
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +15,22 @@ from mlflow.exceptions import MlflowException
 from mlflow.tracking.context.registry import resolve_tags
 from numpy.typing import NDArray
 
-from avp_habitat.metrics import explained
+from avp_habitat import tables
+from avp_habitat.metrics import FIGURES, explained, mean_and_half_width
 from avp_habitat.provenance import flat
+from avp_habitat.rollout.images import read_rgb
 from avp_habitat.tracking.experiments import chosen_experiment, experiment_id
 from avp_habitat.tracking.names import COLOUR_TAG, NOTE_TAG, safe_name
 from avp_habitat.tracking.stores import DEFAULT_ADDRESS, TrackingError, connect, first_line, shown
 from avp_habitat.tracking.view import prepare_experiment, run_colour
-from avp_sb3.evaluation.policy import PolicyResult, mean_and_half_width
+from avp_sb3.evaluation.policy import PolicyResult
 from avp_sb3.evaluation.report import PLOT_FILE, ReportError, cells, cpv, summary
 
 TABLE = "policies.json"
 """Artifact of the upper run that MLflow's page shows as a table."""
-KIND_TAG, KIND = "avp.kind", "evaluation"
-_TOLD = ("policy", "coverage [%]", "views", "CpV [%/view]", "ended by a stop [%]", "episodes")
-_TERMS = f"{explained('coverage', 'views', 'CpV', 'stop')}."
-_PREFIX = "eval"
+_NOTED = ("policy", *(FIGURES[name].heading for name in ("coverage", "views", "cpv", "stopped")), "episodes")
+"""Columns of the table that the page shows above all else."""
+_TERMS = f"Means over the episodes; ± is half of the 95 % interval.\n\n{explained('coverage', 'views', 'CpV', 'stop')}."
 _MAX_PARAM, _MAX_TAG = 6000, 5000
 
 
@@ -39,8 +40,8 @@ def track_evaluation(
     folder: Path,
     *,
     experiment: str | None,
-    complete: bool = True,
-    pictures: Mapping[str, NDArray[np.uint8]] | None = None,
+    pictures: Mapping[str, NDArray[np.uint8]],
+    metrics: Iterable[Any] = (),
 ) -> tuple[str, str, str]:
     """Log an evaluation.
 
@@ -51,11 +52,12 @@ def track_evaluation(
 
     Args:
         results: of the policies.
-        about: what was evaluated; becomes parameters.
+        about: what was evaluated, as `avp_sb3.evaluate` writes it; becomes parameters. Unless it is `complete`, the
+            runs are marked as interrupted.
         folder: of the report; its files become artifacts of the upper run.
         experiment: MLflow experiment, made when it does not exist; as `experiments.chosen_experiment` says when None.
-        complete: False marks the runs as interrupted.
         pictures: `(h, w, 3)` by policy, for those that have one.
+        metrics: as of `report.table`.
 
     Raises:
         ReportError: MLflow failed; the report is on disk.
@@ -69,7 +71,7 @@ def track_evaluation(
         client = connect(address)
         identity = experiment_id(client, *chosen_experiment(experiment))
         prepare_experiment(client, identity)
-        parent = _log(client, identity, results, about, folder, "FINISHED" if complete else "KILLED", pictures or {})
+        parent = _log(client, identity, results, about, folder, pictures, cells(results, metrics))
         name = client.get_experiment(identity).name
     except (MlflowException, TrackingError, OSError) as error:
         raise ReportError(f"the report is in {folder}, but MLflow did not take it: {first_line(error)}") from error
@@ -82,87 +84,54 @@ def _log(
     results: Sequence[PolicyResult],
     about: Mapping[str, Any],
     folder: Path,
-    status: str,
     pictures: Mapping[str, NDArray[np.uint8]],
+    shown: Mapping[str, list[str]],
 ) -> str:
-    tags = _tags(about)
-    params = [Param(safe_name(name), str(value)[:_MAX_PARAM]) for name, value in flat(about).items()]
+    status = "FINISHED" if about["complete"] else "KILLED"
+    scene = {"avp.scene": str(about["scene"]["name"]), "avp.scene_digest": str(about["scene"]["sha256"])}
+    tags = dict(resolve_tags()) | {"avp.kind": "evaluation"} | scene
     parent = client.create_run(experiment, run_name="evaluation", tags=tags).info.run_id
-    client.log_batch(parent, params=params)
-    names = _names(results)
+    client.log_batch(parent, params=_params(flat(about)))
+    # As rollouts have them, or as they were given where two would be the same.
+    short = Counter(Path(result.policy).name for result in results)
+    names = [name if short[name := Path(each.policy).name] == 1 else each.policy for each in results]
     for result, name in zip(results, names, strict=True):
         own = {"mlflow.parentRunId": parent, "avp.policy": name, COLOUR_TAG: run_colour(name)}
         own |= {"avp.policy_run": result.training_run} if result.training_run else {}
         run = client.create_run(experiment, run_name=name, tags=tags | own).info.run_id
-        client.log_batch(run, metrics=_metrics(result), params=_own_params(result, about))
+        # Few: the page writes all of a run's above its picture; the upper run has the others, which all policies share.
+        shared = {"episodes": about["episodes"], "seed": about["seed"], "budget": about["settings"]["budget"]}
+        params = _params({"policy": result.policy, "observation": result.observation, **shared})
+        client.log_batch(run, metrics=_metrics(result), params=params)
         if result.policy in pictures:
-            client.log_image(run, pictures[result.policy], key=f"{_PREFIX}/trajectory", step=0)
+            client.log_image(run, pictures[result.policy], key="eval/trajectory", step=0)
         client.set_terminated(run, status)
-    _log_table(client, parent, results, names)
+    columns = {"policy": names, **shown}
+    client.log_table(parent, columns, TABLE)
+    rows = zip(*(columns[heading] for heading in _NOTED), strict=True)
+    note = f"{tables.table(_NOTED, list(rows))}\n\n{_TERMS}"
+    client.set_tag(parent, NOTE_TAG, note[:_MAX_TAG])
     client.log_artifacts(parent, os.fspath(folder))
-    _log_plot(client, parent, folder / PLOT_FILE)
+    # Once more as a picture by step, because only such appear among the charts.
+    client.log_image(parent, read_rgb(folder / PLOT_FILE), key="eval/coverage_by_view", step=0)
     client.set_terminated(parent, status)
     return parent
 
 
-def _own_params(result: PolicyResult, about: Mapping[str, Any]) -> list[Param]:
-    """Few: the page writes all of a run's above its picture; the upper run has the others, which all policies share."""
-    settings = about.get("settings")
-    shared = {name: about.get(name) for name in ("episodes", "seed")}
-    shared["budget"] = settings.get("budget") if isinstance(settings, Mapping) else None
-    own = {"policy": result.policy, "observation": result.observation, **shared}
-    return [Param(name, str(value)[:_MAX_PARAM]) for name, value in own.items() if value is not None]
-
-
-def _tags(about: Mapping[str, Any]) -> dict[str, str]:
-    tags = dict(resolve_tags()) | {KIND_TAG: KIND}
-    scene = about.get("scene")
-    if isinstance(scene, Mapping):
-        named = {"avp.scene": scene.get("name"), "avp.scene_digest": scene.get("sha256")}
-        tags |= {key: str(value) for key, value in named.items() if value is not None}
-    return tags
-
-
-def _names(results: Sequence[PolicyResult]) -> list[str]:
-    """The policies' names as rollouts have them, or as they were given where two would be the same."""
-    short = [Path(result.policy).name for result in results]
-    count = Counter(short)
-    return [name if count[name] == 1 else result.policy for name, result in zip(short, results, strict=True)]
-
-
-def _log_table(client: MlflowClient, run: str, results: Sequence[PolicyResult], names: Sequence[str]) -> None:
-    """The policies as rows of a table; the most telling columns also as text that the page shows above all else."""
-    columns = {"policy": list(names), **cells(results)}
-    client.log_table(run, columns, TABLE)
-    told = {title: columns[title] for title in _TOLD if title in columns}
-    rows = [told, ["---"] * len(told), *zip(*told.values(), strict=True)]
-    lines = [f"| {' | '.join(row)} |" for row in rows]
-    note = "\n".join([*lines, "", "Means over the episodes; ± is half of the 95 % interval.", "", _TERMS])
-    client.set_tag(run, NOTE_TAG, note[:_MAX_TAG])
-
-
-def _log_plot(client: MlflowClient, run: str, path: Path) -> None:
-    """Once more as a picture by step, because only such appear among the charts."""
-    from avp_habitat.rollout.images import read_rgb
-
-    if path.is_file():
-        client.log_image(run, read_rgb(path), key=f"{_PREFIX}/coverage_by_view", step=0)
+def _params(values: Mapping[str, Any]) -> list[Param]:
+    return [Param(safe_name(name), str(value)[:_MAX_PARAM]) for name, value in values.items()]
 
 
 def _metrics(result: PolicyResult) -> list[Metric]:
     now = int(time.time() * 1000)
     metrics = [
-        Metric(f"{_PREFIX}/episodes", float(len(result.seeds)), now, 0),
-        Metric(f"{_PREFIX}/cpv", cpv(result), now, 0),
+        Metric("eval/episodes", float(len(result.seeds)), now, 0),
+        Metric("eval/cpv", cpv(result), now, 0),
     ]
     for name, values in summary(result).items():
-        metrics += _pair(f"{_PREFIX}/{name}", values["mean"], values["half_width"], now, 0)
-    mean, half = mean_and_half_width(result.curve)
-    for view, (value, width) in enumerate(zip(mean, half, strict=True), start=1):
-        metrics += _pair(f"{_PREFIX}/curve", float(value), None if np.isnan(width) else float(width), now, view)
+        pair = {f"eval/{name}": values["mean"], f"eval/{name}_ci95": values["half_width"]}
+        metrics += [Metric(safe_name(key), value, now, 0) for key, value in pair.items() if value is not None]
+    for name, values in zip(("eval/curve", "eval/curve_ci95"), mean_and_half_width(result.curve), strict=True):
+        known = [(view, float(value)) for view, value in enumerate(values, start=1) if np.isfinite(value)]
+        metrics += [Metric(name, value, now, view) for view, value in known]
     return metrics
-
-
-def _pair(name: str, mean: float | None, half: float | None, now: int, step: int) -> list[Metric]:
-    values = {name: mean, f"{name}_ci95": half}
-    return [Metric(key, value, now, step) for key, value in values.items() if value is not None]

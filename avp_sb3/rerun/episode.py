@@ -1,16 +1,16 @@
-"""An environment's finished episode as a Rerun recording shows it."""
+"""An episode as a Rerun recording shows it: scene, floor, path, views, pictures and figures by time."""
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rerun as rr
+from avp_habitat.rollout.png import GREY_16
 from numpy.typing import NDArray
 from PIL import Image
 
-from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout import images
 
@@ -18,28 +18,21 @@ if TYPE_CHECKING:
     from avp_habitat.navigation.area import NavigableArea
     from avp_habitat.task.trajectory import Trajectory
 
-
+Time = int | np.timedelta64 | np.datetime64
+"""A number in a sequence, a duration, or a moment."""
 _UNSEEN_COLOUR, _SEEN_COLOUR = 0xAEB4C0FF, 0x35B779FF
 _PATH_COLOUR, _VIEW_COLOUR, _AGENT_COLOUR = (178, 34, 52), (228, 120, 51, 120), (40, 40, 44)
-_PLOT_COLOURS = (
-    0x35B779FF,
-    0x8C7AE6FF,
-    0x95A5A6FF,
-    0xE15759FF,
-    0x4E79A7FF,
-    0xF28E2BFF,
-    0x76B7B2FF,
-    0xEDC948FF,
-    0xB07AA1FF,
-)
+_PLOT_COLOURS = [0x35B779FF, 0x8C7AE6FF, 0x95A5A6FF, 0xE15759FF, 0x4E79A7FF]
+_PLOT_COLOURS += [0xF28E2BFF, 0x76B7B2FF, 0xEDC948FF, 0xB07AA1FF]
 _CELL_CHANGES = 200_000
 _PYRAMID_M = 0.15
+_PATH_LIFT_M = 0.02
 _JPEG_QUALITY = 80
 
 
 @dataclass(frozen=True)
 class EncodedView:
-    """A pictured view, compressed."""
+    """A picture and its depth, compressed."""
 
     rgb: bytes
     """JPEG file."""
@@ -48,13 +41,13 @@ class EncodedView:
 
 
 @dataclass(frozen=True)
-class Episode:
+class RecordedEpisode:
     """What a recording shows of t steps."""
 
     camera_to_world: NDArray[np.floating]
     """`(t, 4, 4)` sensor poses, habitat axes, metres."""
     path: NDArray[np.floating]
-    """`(p, 3)` the way, metres, world frame."""
+    """`(p, 3)` the way on the floor, metres, world frame."""
     intrinsics: Intrinsics
     """Of the pictures."""
     views: Mapping[int, EncodedView]
@@ -69,18 +62,29 @@ class Episode:
     """Side of a cell in metres."""
 
 
+def episode_of(
+    trajectory: "Trajectory", area: "NavigableArea | None", intrinsics: Intrinsics, views: Mapping[int, EncodedView]
+) -> RecordedEpisode:
+    """The episode of an environment; without its area no floor is shown."""
+    parts = {f"reward/{name}": values for name, values in trajectory.reward_parts.items()}
+    floor: dict[str, Any] = {}
+    if area is not None:
+        floor = {"cells": np.asarray(area.centres), "first_seen": trajectory.first_seen, "cell_m": area.cell_m}
+    return RecordedEpisode(
+        camera_to_world=trajectory.camera_to_world,
+        path=np.concatenate([trajectory.start[None], trajectory.position]),
+        intrinsics=intrinsics,
+        views=views,
+        plots={"coverage": trajectory.coverage, "action": trajectory.action, "reward/sum": trajectory.reward, **parts},
+        **floor,
+    )
+
+
 def encode_view(rgb: NDArray[np.uint8], depth: NDArray[np.floating]) -> EncodedView:
-    """Compress `(h, w, 3)` uint8 as JPEG, and `(h, w)` planar depth in metres as 16-bit PNG."""
-    buffer = io.BytesIO()
-    Image.fromarray(images.encode_depth(depth)).save(buffer, format="PNG", compress_level=4)
-    return EncodedView(encode_jpeg(rgb), buffer.getvalue())
-
-
-def encode_jpeg(rgb: NDArray[np.uint8]) -> bytes:
-    """A `(h, w, 3)` uint8 picture as a JPEG file."""
+    """Compress a `(h, w, 3)` picture, and its `(h, w)` planar depth in metres."""
     buffer = io.BytesIO()
     Image.fromarray(rgb).save(buffer, format="JPEG", quality=_JPEG_QUALITY)
-    return buffer.getvalue()
+    return EncodedView(buffer.getvalue(), images.encode_png(images.encode_depth(depth), GREY_16))
 
 
 def spread_indices(count: int, at_most: int) -> list[int]:
@@ -91,11 +95,10 @@ def spread_indices(count: int, at_most: int) -> list[int]:
 def log_episode(
     recording: rr.RecordingStream,
     root: str,
-    episode: Episode,
+    episode: RecordedEpisode,
     *,
-    number: int,
+    times: Mapping[str, Time],
     first_step: int = 0,
-    env_step: int = 0,
     with_scene: bool = True,
 ) -> None:
     """Add an episode to a recording.
@@ -104,54 +107,65 @@ def log_episode(
         recording: where to.
         root: entity path above `world` and `plots`.
         episode: what happened.
-        number: of the episode (time line `episode`).
+        times: the values that further time lines have throughout, such as `episode` and `env_step`.
         first_step: value of the time line `step` at the episode's first step.
-        env_step: value of the time line `env_step`.
         with_scene: also add what holds at all times (axes, cells, camera, looks); once per root is enough.
     """
     steps = len(episode.camera_to_world)
     if not steps:
         return
-    clock = _Clock(number, first_step, env_step)
     if with_scene:
         _log_scene(recording, root, episode)
-    clock.set(recording)
     world = f"{root}/world"
-    recording.log(f"{world}/path", rr.LineStrips3D([_lifted(episode.path)], colors=[_PATH_COLOUR], radii=[0.015]))
-    recording.log(f"{world}/views", rr.LineStrips3D(_pyramids(episode), colors=[_VIEW_COLOUR], radii=[0.003]))
-    recording.reset_time()
-    _send_floor(recording, f"{world}/floor", episode, clock)
-    recording.send_columns(f"{world}/agent", clock.columns(range(steps)), _transforms(episode.camera_to_world))
+    start, columns = {**times, "step": first_step}, time_columns(range(first_step, first_step + steps), times)
+    lifted = np.asarray(episode.path) + np.array([0, _PATH_LIFT_M, 0])
+    log_at(recording, f"{world}/path", rr.LineStrips3D([lifted], colors=[_PATH_COLOUR], radii=[0.015]), start)
+    views = rr.LineStrips3D(_pyramids(episode), colors=[_VIEW_COLOUR], radii=[0.003])
+    log_at(recording, f"{world}/views", views, start)
+    recording.send_columns(f"{world}/agent", columns, _transforms(episode.camera_to_world))
     for name, values in episode.plots.items():
-        columns = rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64))
-        recording.send_columns(_plot_path(root, name), clock.columns(range(steps)), columns)
+        scalars = rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64))
+        recording.send_columns(_plot_path(root, name), columns, scalars)
+    if len(episode.cells):
+        changes, colours = _floor_changes(episode)
+        at = time_columns([first_step + step for step in changes], times)
+        recording.send_columns(f"{world}/floor", at, colours)
     if episode.views:
-        _send_views(recording, f"{world}/camera", episode, clock)
+        at = time_columns([first_step + step for step in sorted(episode.views)], times)
+        _send_views(recording, f"{world}/camera", episode, at)
 
 
-@dataclass(frozen=True)
-class _Clock:
-    """The time lines of one episode."""
-
-    number: int
-    first_step: int
-    env_step: int
-
-    def set(self, recording: rr.RecordingStream) -> None:
-        recording.set_time("step", sequence=self.first_step)
-        recording.set_time("episode", sequence=self.number)
-        recording.set_time("env_step", sequence=self.env_step)
-
-    def columns(self, steps: Sequence[int]) -> list[rr.TimeColumn]:
-        count = len(steps)
-        return [
-            rr.TimeColumn("step", sequence=[self.first_step + step for step in steps]),
-            rr.TimeColumn("episode", sequence=[self.number] * count),
-            rr.TimeColumn("env_step", sequence=[self.env_step] * count),
-        ]
+def log_at(recording: rr.RecordingStream, path: str, value: Any, times: Mapping[str, Time]) -> None:
+    """Add a value at one place on several time lines."""
+    for name, time in times.items():
+        recording.set_time(name, **_by_kind(time, time))
+    recording.log(path, value)
+    recording.reset_time()
 
 
-def _log_scene(recording: rr.RecordingStream, root: str, episode: Episode) -> None:
+def time_columns(steps: Sequence[int], times: Mapping[str, Time]) -> list[rr.TimeColumn]:
+    """The time line `step`, and others that have the same value at all of these steps."""
+    columns = [rr.TimeColumn(name, **_by_kind(time, np.full(len(steps), time))) for name, time in times.items()]
+    return [rr.TimeColumn("step", sequence=list(steps)), *columns]
+
+
+def _by_kind(time: Time, value: Any) -> dict[str, Any]:
+    """The argument by which Rerun takes a time of this kind."""
+    return {{"m": "duration", "M": "timestamp"}.get(np.asarray(time).dtype.kind, "sequence"): value}
+
+
+def metric_path(root: str, name: str) -> str:
+    """The entity of an episode's figure; `return_NAME` is shown as `return/NAME`."""
+    group = "return/" if name.startswith("return_") else ""
+    return f"{root}/metrics/{group}{rr.escape_entity_path_part(name.removeprefix('return_'))}"
+
+
+def _plot_path(root: str, name: str) -> str:
+    """The entity of a step's figure, whose name may have signs that Rerun would not take as they are."""
+    return "/".join([root, "plots", *map(rr.escape_entity_path_part, name.split("/"))])
+
+
+def _log_scene(recording: rr.RecordingStream, root: str, episode: RecordedEpisode) -> None:
     """What holds at all times."""
     world = f"{root}/world"
     recording.log(world, rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
@@ -159,8 +173,7 @@ def _log_scene(recording: rr.RecordingStream, root: str, episode: Episode) -> No
     if episode.views:
         recording.log(f"{world}/camera", _pinhole(episode.intrinsics), static=True)
     if len(episode.cells):
-        cells = rr.Points3D(episode.cells, radii=[0.45 * episode.cell_m])
-        recording.log(f"{world}/floor", cells, static=True)
+        recording.log(f"{world}/floor", rr.Points3D(episode.cells, radii=[0.45 * episode.cell_m]), static=True)
     for index, name in enumerate(episode.plots):
         colour = _PLOT_COLOURS[index % len(_PLOT_COLOURS)]
         dots = rr.SeriesPoints(colors=[colour], marker_sizes=[2])
@@ -168,29 +181,20 @@ def _log_scene(recording: rr.RecordingStream, root: str, episode: Episode) -> No
         recording.log(_plot_path(root, name), looks, static=True)
 
 
-def _plot_path(root: str, name: str) -> str:
-    """Where a figure's curve is; its name may have signs that Rerun would not take as they are."""
-    return "/".join([root, "plots", *map(rr.escape_entity_path_part, name.split("/"))])
-
-
-def _send_floor(recording: rr.RecordingStream, path: str, episode: Episode, clock: _Clock) -> None:
-    """The colours of the cells, again at each step that observed new ones; at fewer steps on large floors."""
-    cells = len(episode.cells)
-    if not cells:
-        return
-    seen = np.asarray(episode.first_seen)
+def _floor_changes(episode: RecordedEpisode) -> tuple[list[int], rr.ComponentColumnList]:
+    """The cells' colours at each step (from 0) that observed new ones; at fewer steps on large floors."""
+    cells, seen = len(episode.cells), np.asarray(episode.first_seen)
     changes = [0, *sorted({int(step) - 1 for step in seen[seen > 0]} - {0})]
     changes = [changes[index] for index in spread_indices(len(changes), max(2, _CELL_CHANGES // cells))]
     observed = np.stack([(seen > 0) & (seen <= step + 1) for step in changes])
     colours = np.where(observed, np.uint32(_SEEN_COLOUR), np.uint32(_UNSEEN_COLOUR))
-    columns = rr.Points3D.columns(colors=colours.ravel()).partition([cells] * len(changes))
-    recording.send_columns(path, clock.columns(changes), columns)
+    return changes, rr.Points3D.columns(colors=colours.ravel()).partition([cells] * len(changes))
 
 
-def _send_views(recording: rr.RecordingStream, path: str, episode: Episode, clock: _Clock) -> None:
+def _send_views(recording: rr.RecordingStream, path: str, episode: RecordedEpisode, times: list[rr.TimeColumn]) -> None:
     """The pictures, and where their camera stood."""
     steps = sorted(episode.views)
-    times, views = clock.columns(steps), [episode.views[step] for step in steps]
+    views = [episode.views[step] for step in steps]
     recording.send_columns(path, times, _transforms(episode.camera_to_world[steps]))
     colour = rr.EncodedImage.columns(blob=[view.rgb for view in views], media_type=["image/jpeg"] * len(views))
     recording.send_columns(f"{path}/rgb", times, colour)
@@ -218,7 +222,7 @@ def _pinhole(intrinsics: Intrinsics, colour: tuple[int, int, int] | None = None)
     )
 
 
-def _pyramids(episode: Episode) -> NDArray[np.floating]:
+def _pyramids(episode: RecordedEpisode) -> NDArray[np.floating]:
     """`(t, 11, 3)` one line strip per viewpoint: the image's border and its edges to the camera centre."""
     camera = episode.intrinsics
     left, right = -camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
@@ -227,37 +231,3 @@ def _pyramids(episode: Episode) -> NDArray[np.floating]:
     strip = _PYRAMID_M * np.array([o, a, b, o, c, d, o, a, d, c, b])
     poses = episode.camera_to_world
     return np.einsum("nij,sj->nsi", poses[:, :3, :3], strip) + poses[:, None, :3, 3]
-
-
-def _lifted(path: NDArray[np.floating]) -> NDArray[np.floating]:
-    """A little above the floor, so that the floor does not hide the line."""
-    return np.asarray(path) + np.array([0, 0.02, 0])
-
-
-def episode_of(
-    trajectory: "Trajectory",
-    area: "NavigableArea | None",
-    intrinsics: Intrinsics,
-    views: Mapping[int, EncodedView],
-) -> Episode:
-    """The episode of an environment; without its area no floor is shown.
-
-    Raises:
-        UsageError: the trajectory belongs to another scene than the area.
-    """
-    if area is not None and len(trajectory.first_seen) != len(area.centres):
-        raise UsageError(
-            f"the trajectory knows {len(trajectory.first_seen)} navigable cells, the environment's area "
-            f"{len(area.centres)}: they belong to different scenes"
-        )
-    parts = {f"reward/{name}": values for name, values in trajectory.reward_parts.items()}
-    episode = Episode(
-        camera_to_world=trajectory.camera_to_world,
-        path=np.concatenate([trajectory.start[None], trajectory.position]),
-        intrinsics=intrinsics,
-        views=views,
-        plots={"coverage": trajectory.coverage, "action": trajectory.action, "reward/sum": trajectory.reward, **parts},
-    )
-    if area is None:
-        return episode
-    return replace(episode, cells=np.asarray(area.centres), first_seen=trajectory.first_seen, cell_m=area.cell_m)

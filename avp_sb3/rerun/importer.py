@@ -1,100 +1,27 @@
 """The program that Rerun calls for every path it opens: it answers with the recording of a rollout, or declines.
 
 `rerun ROLLOUT` calls `rerun-importer-avp ROLLOUT --application-id … --recording-id …` and reads the recording from the
-standard output. To decline is exit code 66, decided before anything large is imported.
+standard output. To decline is exit code 66, decided before anything large is imported (hence argparse).
 """
 
 import argparse
 import os
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
+from avp_sb3.rerun import APPLICATION
 
-from avp_habitat.command import run
-from avp_habitat.errors import UsageError
-from avp_habitat.rollout.format import read_rollout
-from avp_sb3.rerun.destination import Destination, Time, is_shown_with_its_folder, rollouts_at
-from avp_sb3.rerun.layout import APPLICATION
-from avp_sb3.rerun.recording import recording_bytes
-
-# Rerun gives every recording these by itself.
-_AUTOMATIC = ("log_time", "log_tick")
-
-
-def answer(folders: Sequence[str], options: argparse.Namespace) -> int:
-    """Write the recording of rollouts to the standard output.
-
-    Args:
-        folders: of the rollouts.
-        options: as parsed by the importer.
-
-    Returns:
-        Exit code: 0, or 1 with one line on stderr when a rollout is damaged.
-    """
-
-    def write(_: Sequence[str]) -> None:
-        destination = destination_of(options)
-        written = recording_bytes([read_rollout(folder) for folder in folders], destination)
-        sys.stdout.buffer.write(written)
-        sys.stdout.buffer.flush()
-
-    return run(write, [])
-
-
-def destination_of(options: argparse.Namespace) -> Destination:
-    """What the caller wants the rollouts to be part of.
-
-    Raises:
-        UsageError: a time is not a name and a whole number, or a name holds bytes that are no text.
-    """
-    for option in ("application_id", "recording_id", "entity_path_prefix"):
-        if _is_no_text(getattr(options, option)):
-            raise UsageError(f"--{option.replace('_', '-')}: expected a text, got {getattr(options, option)!r}")
-    joins = options.recording_id is not None and options.recording_id == options.opened_recording_id
-    return Destination(
-        application_id=options.application_id or APPLICATION,
-        recording_id=options.recording_id,
-        prefix=options.entity_path_prefix,
-        times=_times(options),
-        own=not joins and not options.entity_path_prefix.strip("/"),
-    )
-
-
-def _is_no_text(value: str | None) -> bool:
-    """Whether the command line held other bytes than UTF-8, which Python keeps as surrogates and Rerun refuses."""
-    return any("\ud800" <= letter <= "\udfff" for letter in value or "")
-
-
-def _times(options: argparse.Namespace) -> dict[str, Time]:
-    older = dict(_pairs("--sequence", options.sequence))
-    times: dict[str, Time] = dict(_pairs("--time_sequence", options.time_sequence))
-    for name, value in _pairs("--time_duration_nanos", options.time_duration_nanos):
-        # Rerun 0.41 sends moments as durations; only the older flag beside them tells.
-        times[name] = np.datetime64(value, "ns") if name in older else np.timedelta64(value, "ns")
-    for name, value in _pairs("--time_timestamp_nanos", options.time_timestamp_nanos):
-        times[name] = np.datetime64(value, "ns")
-    return times
-
-
-def _pairs(option: str, texts: Sequence[str]) -> Iterator[tuple[str, int]]:
-    for text in texts:
-        name, _, value = text.rpartition("=")
-        try:
-            number = int(value)
-        except ValueError:
-            number = None
-        if not name or number is None or abs(number) >= 2**63:
-            raise UsageError(f"{option}: expected NAME=NUMBER with a whole number, got {text!r}")
-        if name not in _AUTOMATIC:
-            yield name, number
-
+if TYPE_CHECKING:
+    from avp_sb3.rerun.episode import Time
 
 INCOMPATIBLE = 66
 """Rerun's exit code of an importer that does not know a path."""
-_USAGE = 2
 _NAME, _DEPRECATED_PREFIX = "rerun-importer-avp", "rerun-loader-"
+_META, _MARK, _HEAD_BYTES = "rollout.json", b"avp-rollout", 65_536
+_AUTOMATIC = ("log_time", "log_tick")  # Rerun gives every recording these by itself.
 
 
 def main() -> int:
@@ -105,19 +32,89 @@ def main() -> int:
         folder), 66 when the path is no rollout, 1 when it is a damaged one, 2 for a usage error.
     """
     options = _parse(sys.argv[1:])
-    if _other_name_answers(options):
-        return INCOMPATIBLE
+    asked_as = os.path.basename(sys.argv[0])
+    if asked_as.startswith(_DEPRECATED_PREFIX) and options.recording_id and shutil.which(_NAME):
+        return INCOMPATIBLE  # The viewer asks under the new name, too.
     folders = rollouts_at(options.path)
-    if options.recording_id and is_shown_with_its_folder(options.path, options.application_id):
+    if options.recording_id and _is_shown_with_its_folder(options.path, options.application_id):
         return 0
     if not folders:
         return INCOMPATIBLE
-    if sys.stdout.isatty():
-        print(f"error: expected the output to go to a viewer or a file: try `rerun {options.path}`", file=sys.stderr)
-        return _USAGE
-    pass
+    from avp_habitat.command import run
 
-    return answer(folders, options)
+    return run(lambda _: _answer(folders, options), [])
+
+
+def rollouts_at(path: Path) -> list[Path]:
+    """The rollouts that a path stands for: itself, the one whose `rollout.json` it is, or those directly in it."""
+    if path.is_dir():
+        if _is_rollout(path):
+            return [path]
+        return sorted(folder for folder in path.iterdir() if not folder.name.startswith(".") and _is_rollout(folder))
+    return [path.parent] if path.name == _META and _is_rollout(path.parent) else []
+
+
+def _is_rollout(folder: Path) -> bool:
+    """Whether a folder is one of ours, be it damaged: by one of the first lines of its `rollout.json`."""
+    try:
+        if not (folder / _META).is_file():
+            return False
+        with (folder / _META).open("rb") as file:
+            return _MARK in file.read(_HEAD_BYTES)
+    except OSError:
+        return False
+
+
+def _is_shown_with_its_folder(path: Path, application_id: str | None) -> bool:
+    """Whether a file of a rollout is asked about only because its folder is being opened.
+
+    A viewer that opens a folder asks about it, then about each file in it, with the folder's name as application id
+    (none for the folder `.`); a file that is opened by itself carries its own name.
+    """
+    folder = path.absolute().parent
+    if not path.is_file() or not _is_rollout(folder) or application_id == _application_id(path):
+        return False
+    return application_id in (None, _application_id(folder), _application_id(folder.parent))
+
+
+def _application_id(path: Path) -> str:
+    """The name that a viewer makes of a path."""
+    return path.stem.replace(".", "_")
+
+
+def _answer(folders: Sequence[Path], options: argparse.Namespace) -> None:
+    """Write the recording of rollouts to the standard output."""
+    import rerun as rr
+
+    from avp_habitat.rollout.format import read_rollout
+    from avp_sb3.rerun.rollout import log_rollouts
+
+    prefix, identity = options.entity_path_prefix, options.recording_id
+    is_alone = not prefix.strip("/") and (identity is None or identity != options.opened_recording_id)
+    application = options.application_id or APPLICATION
+    recording = rr.RecordingStream(application, recording_id=identity, send_properties=is_alone)
+    rollouts = [read_rollout(folder) for folder in folders]
+    log_rollouts(recording, rollouts, prefix=prefix, times=_times(options), with_layout=is_alone)
+    sys.stdout.buffer.write(recording.binary_stream().read() or b"")
+    sys.stdout.buffer.flush()
+
+
+def _times(options: argparse.Namespace) -> "dict[str, Time]":
+    """The time lines that an application wants the rollouts to have, each with its one value."""
+    import numpy as np
+
+    moments = dict(options.sequence)
+    times: list[tuple[str, Time]] = [*options.time_sequence]
+    for name, value in options.time_duration_nanos:
+        # Rerun 0.41 sends moments as durations; only the older flag beside them tells.
+        times.append((name, np.datetime64(value, "ns") if name in moments else np.timedelta64(value, "ns")))
+    times += [(name, np.datetime64(value, "ns")) for name, value in options.time_timestamp_nanos]
+    return {name: time for name, time in times if name not in _AUTOMATIC}
+
+
+def _named_number(text: str) -> tuple[str, int]:
+    name, _, number = text.rpartition("=")
+    return name, int(number)
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -125,28 +122,15 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog=_NAME,
         allow_abbrev=False,
-        description="Called by Rerun for the paths that it opens: try `rerun ROLLOUT`. Writes the recording of a "
-        f"rollout folder, of its rollout.json or of a folder of rollouts to the standard output; exit code "
-        f"{INCOMPATIBLE} for everything else.",
+        description="Called by Rerun for the paths that it opens: try `rerun ROLLOUT`. Writes the recording to the "
+        f"standard output; exit code {INCOMPATIBLE} for what is no rollout.",
     )
-    parser.add_argument("path", help="rollout folder, its rollout.json, or a folder of rollouts")
+    parser.add_argument("path", type=Path, help="rollout folder, its rollout.json, or a folder of rollouts")
     parser.add_argument("--application-id", help="application of the recording")
     parser.add_argument("--recording-id", help="recording to add to")
-    parser.add_argument("--opened-application-id", help="application of the recording on show")
     parser.add_argument("--opened-recording-id", help="recording on show")
     parser.add_argument("--entity-path-prefix", default="", help="entity path above all that is added")
-    pair = {"action": "append", "default": [], "metavar": "NAME=NUMBER"}
-    parser.add_argument("--time_sequence", help="further time line with the value that it has throughout", **pair)
-    parser.add_argument("--time_duration_nanos", help="likewise, a duration in nanoseconds", **pair)
-    parser.add_argument("--time_timestamp_nanos", help="likewise, nanoseconds since 1970", **pair)
-    parser.add_argument("--sequence", help="older name, sent along with the others", **pair)
-    parser.add_argument("--time", help="older name, sent along with the others", **pair)
-    for name in ("--static", "--timeless"):
-        parser.add_argument(name, action="store_true", help="ignored: a rollout is a sequence of steps")
+    pairs = {"type": _named_number, "action": "append", "default": [], "metavar": "NAME=NUMBER"}
+    for flag in ("--time_sequence", "--time_duration_nanos", "--time_timestamp_nanos", "--sequence"):
+        parser.add_argument(flag, help="a further time line with the value that it has throughout", **pairs)
     return parser.parse_known_args(argv)[0]
-
-
-def _other_name_answers(options: argparse.Namespace) -> bool:
-    """Whether a viewer asks under the deprecated name and under the new one as well, which answers."""
-    asked_as = os.path.basename(sys.argv[0])
-    return asked_as.startswith(_DEPRECATED_PREFIX) and bool(options.recording_id) and shutil.which(_NAME) is not None

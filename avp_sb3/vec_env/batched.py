@@ -14,11 +14,11 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics
 from avp_habitat.ranges import Range, number
-from avp_habitat.simulators.base import Frames, Simulator
-from avp_habitat.simulators.registry import ONE_PER_PROCESS, SimulatorChoice, open_simulator
+from avp_habitat.simulators.base import Frames, Simulator, SingleRays, pictures
+from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.surface.points import scene_surface
 from avp_habitat.task.env import step_info
-from avp_habitat.task.observations import action_space, observation_space
+from avp_habitat.task.observations import Observed, action_space, each, make_observation
 from avp_habitat.task.settings import TaskSettings
 from avp_habitat.task.task import ViewpointTask
 
@@ -45,10 +45,10 @@ class AVPVecEnv(VecEnv):
         """Open the scenes for n agents.
 
         Args:
-            scene: as `avp_habitat.scenes.location.locate` takes it, or several; agent i walks in scene i modulo their
-                number.
+            scene: as `scenes.location.locate` takes it, or several; agent i walks in scene i modulo their number.
             agents: n, at least 1, and at least one for each scene.
-            simulator: a simulator's name, or those that are open already, one for each scene (names are then theirs).
+            simulator: a simulator's name or factory, or those that are open already, one for each scene (names are then
+                theirs).
             gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
             navmesh: file of the only scene's NavMesh; computed when omitted.
             up: axis of mesh files that points up, `y` or `z`; of each file what is known of it when omitted.
@@ -61,29 +61,25 @@ class AVPVecEnv(VecEnv):
             SimulatorError: the simulator cannot run here, or several scenes need a process each (`AVPSubprocVecEnv`).
         """
         self.simulators = _open(scene, simulator, gpu=gpu, navmesh=navmesh, up=up)
-        casts = all(each.name == "raycast" for each in self.simulators)
+        casts = all(isinstance(opened, SingleRays) for opened in self.simulators)
         self.settings = settings or TaskSettings(lookup=casts)
         agents = number("agents", agents, int, Range(0, 1e12))
         if agents < len(self.simulators):
             raise UsageError(f"agents: expected at least {len(self.simulators)}, one for each scene, got {agents}")
         _check_memory(agents, self.simulators, self.settings)
         self.render_mode = None
-        super().__init__(
-            agents,
-            observation_space(self.settings.observation),
-            action_space(),
-        )
         self._task = ViewpointTask(self.simulators, self.settings, agents)
+        super().__init__(agents, self._task.kind.space, action_space())
         self._generators = [np.random.default_rng() for _ in range(agents)]
         self._actions = np.zeros(agents, dtype=np.int64)
         self.seed(seed)
 
     def capture(self, row: int, camera_to_world: NDArray[np.floating], intrinsics: Intrinsics) -> Frames:
         """Pictures and depth of `(k, 4, 4)` habitat poses in an agent's scene, without any effect on the episodes."""
-        return self._task.simulator(row).render(camera_to_world, intrinsics, rgb=True)
+        return pictures(self._task.simulator(row), camera_to_world, intrinsics)
 
-    def reset(self) -> NDArray[np.float32]:  # type: ignore[override]
-        """Start all episodes at random; `(n, 12)`, longer with a map."""
+    def reset(self) -> Observed:  # type: ignore[override]
+        """Start all episodes at random; the first axis of what is observed is n."""
         for index, seed in enumerate(self._seeds):
             if seed is not None:
                 self._generators[index] = np.random.default_rng(seed)
@@ -100,7 +96,7 @@ class AVPVecEnv(VecEnv):
         """Remember the `(n,)` actions."""
         self._actions = np.asarray(actions)
 
-    def step_wait(self) -> tuple[NDArray, NDArray, NDArray, list[dict[str, Any]]]:  # type: ignore[override]
+    def step_wait(self) -> tuple[Observed, NDArray, NDArray, list[dict[str, Any]]]:  # type: ignore[override]
         """Step all agents; those whose episode ended start the next one, as SB3 expects."""
         outcome = self._task.step(self._actions)
         done = outcome.terminated | outcome.truncated
@@ -108,10 +104,10 @@ class AVPVecEnv(VecEnv):
         observation = outcome.observation
         ended = np.flatnonzero(done)
         for row in ended:
-            infos[row]["terminal_observation"] = observation[row].copy()
+            infos[row]["terminal_observation"] = each(lambda values, row=row: values[row].copy(), observation)
             infos[row]["TimeLimit.truncated"] = bool(outcome.truncated[row])
         if len(ended):
-            observation[ended] = self._restart(ended.tolist())
+            each(lambda values, first: values.__setitem__(ended, first), observation, self._restart(ended.tolist()))
         return observation, outcome.reward.astype(np.float32), done, infos
 
     def close(self) -> None:
@@ -143,7 +139,7 @@ class AVPVecEnv(VecEnv):
         """No agent has a Gymnasium wrapper."""
         return [False for _ in self._get_indices(indices)]
 
-    def _restart(self, rows: Sequence[int]) -> NDArray[np.float32]:
+    def _restart(self, rows: Sequence[int]) -> Observed:
         draws = [(self._task.simulator(row).area, self._generators[row]) for row in rows]
         position = np.concatenate([area.random_points(generator, 1) for area, generator in draws])
         yaw = np.array([generator.uniform(-np.pi, np.pi) for _, generator in draws])
@@ -164,7 +160,7 @@ _OF_AGENT = {
 def _check_memory(agents: int, simulators: Sequence[Simulator], settings: TaskSettings) -> None:
     """Refuse what would end in the middle of making it: the agents' cells, surfaces, paths, logs and observations."""
     cells = max(len(simulator.area.centres) for simulator in simulators)
-    numbers = gymnasium.spaces.flatdim(observation_space(settings.observation))
+    numbers = gymnasium.spaces.flatdim(make_observation(settings).space)
     points = max(len(scene_surface(each, settings).points) for each in simulators) if settings.with_surface else 0
     needed = agents * (2 * cells + 4 * points + 8 * 24 * (settings.budget + 1) + 3 * 4 * numbers)
     free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
@@ -181,9 +177,9 @@ def _open(
     if choice is None:
         return list(simulator) if isinstance(simulator, Sequence) else [simulator]  # type: ignore[list-item]
     scenes = scenes_given(scene, choice)
-    if len(scenes) > 1 and choice.simulator in ONE_PER_PROCESS:
+    if len(scenes) > 1 and choice.one_per_process:
         raise UsageError(
-            f"AVPVecEnv: a process can hold one {choice.simulator!r} simulator, expected one scene, got {len(scenes)}: "
+            f"AVPVecEnv: a process can hold one {choice.name!r} simulator, expected one scene, got {len(scenes)}: "
             f"{', '.join(scenes)}; use AVPSubprocVecEnv, which gives each scene a process of its own"
         )
     return [open_simulator(choice, name) for name in scenes]

@@ -1,141 +1,74 @@
 """Many agents as one Stable-Baselines3 `VecEnv` over several processes, each with a simulator of its own."""
 
-import multiprocessing
-import weakref
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import signal
+import time
+import traceback
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from multiprocessing.connection import Connection, wait
+from functools import partial
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from avp_habitat.errors import AVPError, SimulatorError, UsageError
 from avp_habitat.simulators.registry import SimulatorChoice
-from avp_habitat.task.observations import action_space, observation_space
+from avp_habitat.task.observations import Observed, action_space, each, make_observation
 from avp_habitat.task.settings import TaskSettings
-from avp_sb3.vec_env.batched import scenes_given
-from avp_sb3.vec_env.processes import Failure, Order, end_processes, named_deaths, serve
+from avp_sb3.vec_env.batched import AVPVecEnv, scenes_given
 
 START_METHODS = ("forkserver", "spawn")
 _GUARD = '; a script that starts workers needs the guard `if __name__ == "__main__":`, because they import it'
+_GRACE_S = 5.0
+"""How long a worker may take to end by itself, seconds."""
+_GONE = (EOFError, BrokenPipeError, ConnectionResetError)
+"""What a pipe raises when the process at its other end has ended."""
+_HINTS = {
+    "SIGKILL": " (by somebody, or by the system for want of memory)",
+    "SIGSEGV": " (a crash inside the simulator)",
+    "SIGABRT": " (a crash inside the simulator)",
+}
+_FIXED = ("area", "scene_name", "scene_digest", "settings", "render_mode")
+"""Attributes that never change: known also when the workers have ended, so that the last path can be drawn."""
 
 
-class Workers:
-    """Processes that each hold one simulator; none is left when this object is closed, lost, or its program ends."""
+class _Agents(gymnasium.Env):
+    """What a worker holds: some agents in one scene, behind the protocol of SB3's workers for one environment."""
 
-    def __init__(self, orders: Sequence[Order], *, start_method: str) -> None:
-        """Start a process for each order, and wait until all have opened their scenes.
+    def __init__(self, settings: TaskSettings, **options: Any) -> None:
+        # Ctrl-C is left to the parent, which ends its workers.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        self.observation_space, self.action_space = make_observation(settings).space, action_space()
+        self._open = partial(AVPVecEnv, settings=settings, **options)
+        self._agents: AVPVecEnv | None = None
 
-        Args:
-            orders: at least one.
-            start_method: `forkserver` or `spawn`; a forked process cannot use a graphics device.
-
-        Raises:
-            UsageError: another start method.
-            AVPError: as a worker's `AVPVecEnv` raised it, with the worker and its scene.
-            SimulatorError: a worker has ended.
-        """
-        if start_method not in START_METHODS:
-            raise UsageError(f"start_method: expected one of {', '.join(START_METHODS)}, got {start_method!r}")
-        self._orders = list(orders)
-        self._ticket = 0
-        context = multiprocessing.get_context(start_method)
-        self._pipes: list[Connection] = []
-        self.processes: list[Any] = []
-        self._ending = weakref.finalize(self, end_processes, self.processes, self._pipes)
+    def call(self, method: str, *args: Any, **kwargs: Any) -> Any:
+        """What a method of `AVPVecEnv` returns or raises; raised here, it would end the worker with a traceback."""
         try:
-            for order in self._orders:
-                ours, theirs = context.Pipe()
-                self._pipes.append(ours)
-                process = context.Process(target=serve, args=(theirs, order), daemon=True)  # type: ignore[attr-defined]
-                process.start()
-                self.processes.append(process)
-                theirs.close()
-            self._receive(range(len(self.processes)), 0)
-        except BaseException:
-            self.close()
-            raise
-
-    def send(self, requests: Mapping[int, tuple[Any, ...]], name: str) -> None:
-        """Ask some workers; `receive` waits for what they answer.
-
-        Args:
-            requests: arguments by the worker's number.
-            name: of the command.
-
-        Raises:
-            SimulatorError: a worker has ended.
-        """
-        self._check_open()
-        self._ticket += 1
-        with self._deaths():
-            for worker, arguments in requests.items():
-                self._pipes[worker].send((self._ticket, name, arguments))
-
-    def receive(self, workers: Iterable[int]) -> dict[int, Any]:
-        """The answers to what was sent last, by the worker's number.
-
-        Raises:
-            AVPError: as a worker raised it, with the worker and its scene.
-            AttributeError: as a worker raised it.
-            SimulatorError: a worker has ended, or made a mistake of its own.
-        """
-        self._check_open()
-        return self._receive(workers, self._ticket)
-
-    def ask(self, requests: Mapping[int, tuple[Any, ...]], name: str) -> dict[int, Any]:
-        """`send` and `receive`."""
-        self.send(requests, name)
-        return self.receive(requests)
-
-    def close(self) -> None:
-        """End all workers: those that work get some seconds to leave by themselves."""
-        self._ending()
-
-    def _check_open(self) -> None:
-        if not self._ending.alive:
-            raise SimulatorError("AVPSubprocVecEnv: its workers were ended; make a new one")
-
-    def _receive(self, workers: Iterable[int], ticket: int) -> dict[int, Any]:
-        waiting = {self._pipes[worker]: worker for worker in workers}
-        answers: dict[int, Any] = {}
-        with self._deaths():
-            while waiting:
-                # Whoever answers first: a failure is told without waiting for workers that are busy.
-                for pipe in wait(list(waiting)):
-                    answered, value = pipe.recv()  # type: ignore[union-attr]
-                    if answered != ticket:
-                        continue  # To a request whose asker was interrupted.
-                    worker = waiting.pop(pipe)  # type: ignore[arg-type]
-                    if isinstance(value, Failure):
-                        raise value.error(self._name(worker))
-                    answers[worker] = value
-        return answers
-
-    def _deaths(self) -> Any:
-        return named_deaths(self.processes, self._name, self.close, hint="" if self._ticket else _GUARD)
-
-    def _name(self, worker: int) -> str:
-        return f"worker {worker} of {len(self._orders)} (scene {self._orders[worker].scene})"
+            if self._agents is None:
+                self._agents = self._open()
+            return getattr(self._agents, method)(*args, **kwargs)
+        except (AVPError, AttributeError) as error:
+            return error
+        except Exception as error:
+            traceback.print_exc()
+            return SimulatorError(f"{type(error).__name__}: {error}; its traceback stands above")
 
 
-_UNCHANGING = ("area", "scene_name", "scene_digest")
-_STAYS = "simulator"
-
-
-class AVPSubprocVecEnv(VecEnv):
+class AVPSubprocVecEnv(SubprocVecEnv):
     """n agents of `AVP-v0` over worker processes, each of which steps its agents in one scene as an `AVPVecEnv`.
 
     For simulators of which a process can hold one only (Habitat-Sim), and for several cores or GPUs. Observations,
     rewards and `info` are those of `AVPVecEnv` with the same scenes, agents, settings and seed. A program that makes
     one needs the guard `if __name__ == "__main__":`, because its workers import it.
 
-    A worker that fails or ends becomes one error that names it and its scene; the other workers are ended then.
+    A worker that fails or ends becomes one error that names it and its scene; where it has ended, so do the others.
     """
 
     def __init__(
@@ -155,19 +88,17 @@ class AVPSubprocVecEnv(VecEnv):
         """Start the workers, and wait until all scenes are open.
 
         Args:
-            scene: as `avp_habitat.scenes.location.locate` takes it, or several; agent i walks in scene i modulo their
-                number.
+            scene: as of `AVPVecEnv`, like all that is not named here.
             agents: n, at least one for each worker; one for each when omitted.
             workers: processes, a multiple of the number of scenes; one for each scene when omitted. Agent i is of
                 worker i modulo their number.
-            simulator: `raycast` or `habitat`.
-            gpu: the CUDA device of `habitat`, or several, of which worker i takes number i modulo their number; -1
-                for none, None for the first one there is.
-            navmesh: file of the only scene's NavMesh; computed when omitted.
-            up: axis of mesh files that points up, `y` or `z`; of each file what is known of it when omitted.
-            settings: of the task; when omitted, the design's defaults, looked up where the simulator casts rays.
-            seed: of the starts; agent i uses `seed + i`.
-            start_method: `forkserver` or `spawn`.
+            simulator: its name.
+            gpu: the CUDA device of `habitat`, or several, of which worker i takes number i modulo their number.
+            navmesh: as of `AVPVecEnv`.
+            up: as of `AVPVecEnv`.
+            settings: as of `AVPVecEnv`.
+            seed: as of `AVPVecEnv`.
+            start_method: `forkserver` or `spawn`; a forked process cannot use a graphics device.
 
         Raises:
             UsageError: numbers that do not fit each other, or an unknown name.
@@ -175,82 +106,92 @@ class AVPSubprocVecEnv(VecEnv):
             SimulatorError: the simulator cannot run here, or a worker ended.
         """
         gpus = list(gpu) if isinstance(gpu, Sequence) else [gpu]
-        choices = [SimulatorChoice(simulator, gpu=each, navmesh=navmesh and Path(navmesh), up=up) for each in gpus]
+        file = Path(navmesh) if navmesh else None
+        choices = [SimulatorChoice(simulator, gpu=number, navmesh=file, up=up) for number in gpus]
         if not choices:
             raise UsageError("gpu: expected at least one, got none")
+        if start_method not in START_METHODS:
+            raise UsageError(f"start_method: expected one of {', '.join(START_METHODS)}, got {start_method!r}")
         self.scenes = scenes_given(scene, choices[0])
         """Of the agents in turn, as given."""
-        self._count = _workers(workers, len(self.scenes))
-        agents = self._count if agents is None else agents
-        if agents < self._count:
-            raise UsageError(f"agents: expected at least {self._count}, one for each worker, got {agents}")
-        self.settings = settings or TaskSettings(lookup=simulator == "raycast")
-        orders = [
-            Order(
-                self.scenes[worker % len(self.scenes)],
-                choices[worker % len(choices)],
-                len(range(worker, agents, self._count)),
+        count = len(self.scenes) if workers is None else workers
+        if count < 1 or count % len(self.scenes):
+            there_are = "there is 1 scene" if len(self.scenes) == 1 else f"there are {len(self.scenes)} scenes"
+            raise UsageError(f"workers: expected {len(self.scenes)} or a multiple of it, as {there_are}, got {workers}")
+        self._count, self._workers = count, range(count)
+        agents = count if agents is None else agents
+        if agents < count:
+            raise UsageError(f"agents: expected at least {count}, one for each worker, got {agents}")
+        self.settings = settings or TaskSettings(lookup=choices[0].single_rays)
+        self._asked: list[int] = []
+        self._fixed: dict[str, list[Any]] = {}
+        makes: list[Callable[[], gymnasium.Env]] = [
+            partial(
+                _Agents,
                 self.settings,
+                scene=self.scenes[worker % len(self.scenes)],
+                agents=len(range(worker, agents, count)),
+                **vars(choices[worker % len(choices)]),
             )
-            for worker in range(self._count)
+            for worker in self._workers
         ]
-        self._known: dict[tuple[str, int], Any] = {}
-        self._workers = Workers(orders, start_method=start_method)
-        self.render_mode = None
-        super().__init__(agents, observation_space(self.settings.observation), action_space())
+        try:
+            with self._named_death(0, _GUARD):
+                super().__init__(makes, start_method=start_method)
+            # SB3 has counted the workers.
+            VecEnv.__init__(self, agents, self.observation_space, self.action_space)
+            self._fixed = {name: self._of_agents(self._workers, "get_attr", name) for name in _FIXED}
+        except BaseException:
+            self.close()
+            raise
         self.seed(seed)
 
-    @property
-    def processes(self) -> list[Any]:
-        """The workers' processes (`multiprocessing.Process`), in order."""
-        return list(self._workers.processes)
-
-    def reset(self) -> NDArray[np.float32]:  # type: ignore[override]
-        """Start all episodes at random; `(n, 12)`, longer with a map."""
-        count = self._count
-        with _ended_by_errors(self):
-            answers = self._workers.ask({worker: (self._seeds[worker::count],) for worker in range(count)}, "reset")
+    def reset(self) -> Observed:  # type: ignore[override]
+        """Start all episodes at random; the first axis of what is observed is n."""
+        self._send_parts("seed_agents", self._seeds)
+        self._receive()
+        self._send("reset", {worker: ((), {}) for worker in self._workers})
+        observations = self._receive().values()
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{"coverage": 0.0, "views": 0} for _ in range(self.num_envs)]
-        return self._joined(answers[worker] for worker in range(count))
+        return each(self._joined, *observations)
 
     def step_async(self, actions: NDArray[np.integer]) -> None:
         """Send the `(n,)` actions to the workers."""
-        actions = np.asarray(actions)
-        self._workers.send({worker: (actions[worker :: self._count],) for worker in range(self._count)}, "step")
+        self._send_parts("step", np.asarray(actions))
 
-    def step_wait(self) -> tuple[NDArray, NDArray, NDArray, list[dict[str, Any]]]:  # type: ignore[override]
+    def step_wait(self) -> tuple[Observed, NDArray, NDArray, list[dict[str, Any]]]:  # type: ignore[override]
         """What all agents saw; those whose episode ended start the next one, as SB3 expects."""
-        with _ended_by_errors(self):
-            answers = self._workers.receive(range(self._count))
-        columns = list(zip(*(answers[worker] for worker in range(self._count)), strict=True))
+        observations, rewards, dones, own_infos = zip(*self._receive().values(), strict=True)
         infos: list[dict[str, Any]] = [{}] * self.num_envs
-        for worker, own in enumerate(columns[3]):
+        for worker, own in enumerate(own_infos):
             infos[worker :: self._count] = own
-        observation, reward, done = (self._joined(column) for column in columns[:3])
-        return observation, reward, done, infos
+        return each(self._joined, *observations), self._joined(*rewards), self._joined(*dones), infos
 
     def close(self) -> None:
-        """End the workers; they free their simulators."""
-        self._workers.close()
+        """End the workers, also those that do not answer."""
+        if not self.closed:
+            self.closed = True
+            for pipe in self.remotes:
+                pipe.close()
+            _end(self.processes)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """An attribute of the chosen agents, as separate `AVPEnv`s have it; `simulator` stays in its process."""
-        rows = list(self._get_indices(indices))
-        if attr_name == _STAYS:
-            raise UsageError(f"AVPSubprocVecEnv: {_STAYS} stays in its process; ask for area, scene_name or agent_view")
-        if attr_name in ("settings", "render_mode"):
-            return [getattr(self, attr_name) for _ in rows]
-        if attr_name in _UNCHANGING:
-            return [self._unchanging(attr_name, row % self._count) for row in rows]
+        rows = self._get_indices(indices)
+        if attr_name == "simulator":
+            raise UsageError("AVPSubprocVecEnv: simulator stays in its process; ask for area, scene_name or agent_view")
+        if attr_name in self._fixed:
+            return [self._fixed[attr_name][row % self._count] for row in rows]
         return self._of_agents(rows, "get_attr", attr_name)
 
     def has_attr(self, attr_name: str) -> bool:
         """Whether `get_attr` knows the name."""
-        if attr_name in ("settings", "render_mode", *_UNCHANGING):
-            return True
-        return attr_name != _STAYS and self._workers.ask({0: (attr_name,)}, "has_attr")[0]
+        if attr_name in self._fixed or attr_name == "simulator":
+            return attr_name != "simulator"
+        self._send("has_attr", {0: ((attr_name,), {})})
+        return self._receive()[0]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Refused: the agents share one task, whose settings are frozen."""
@@ -258,49 +199,89 @@ class AVPSubprocVecEnv(VecEnv):
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
         """Call a method once for each chosen agent; `capture` looks into that agent's scene."""
-        return self._of_agents(list(self._get_indices(indices)), "env_method", method_name, args, kwargs)
+        return self._of_agents(self._get_indices(indices), "env_method", method_name, *args, **kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """No agent has a Gymnasium wrapper."""
         return [False for _ in self._get_indices(indices)]
 
-    def _of_agents(self, rows: list[int], command: str, name: str, *more: Any) -> list[Any]:
+    def _of_agents(self, rows: Iterable[int], method: str, *args: Any, **kwargs: Any) -> list[Any]:
         """Answers for agents, in the order of `rows`; each worker is asked once."""
-        workers = {
-            row % self._count: [other for other in rows if other % self._count == row % self._count] for row in rows
-        }
-        requests = {worker: (name, [row // self._count for row in own], *more) for worker, own in workers.items()}
-        answers = {worker: iter(answer) for worker, answer in self._workers.ask(requests, command).items()}
+        rows, own = list(rows), defaultdict(list)
+        for row in rows:
+            own[row % self._count].append(row // self._count)
+        self._send(method, {worker: (args, kwargs | {"indices": indices}) for worker, indices in own.items()})
+        answers = {worker: iter(answer) for worker, answer in self._receive().items()}
         return [next(answers[row % self._count]) for row in rows]
 
-    def _unchanging(self, name: str, worker: int) -> Any:
-        if (name, worker) not in self._known:
-            # The agent of a worker's number is that worker's first one.
-            self._known[name, worker] = self._of_agents([worker], "get_attr", name)[0]
-        return self._known[name, worker]
+    def _send(self, method: str, requests: Mapping[int, tuple[tuple[Any, ...], dict[str, Any]]]) -> None:
+        """Ask workers, by their numbers; `_receive` waits for what they answer."""
+        if self.closed:
+            raise SimulatorError("AVPSubprocVecEnv: its workers were ended; make a new one")
+        self._answers()  # To a request whose asker was interrupted.
+        for worker, (args, kwargs) in requests.items():
+            with self._named_death(worker):
+                self.remotes[worker].send(("env_method", ("call", (method, *args), kwargs)))
+            self._asked.append(worker)
 
-    def _joined(self, parts: Iterable[NDArray]) -> NDArray:
-        arrays = list(parts)
+    def _send_parts(self, method: str, values: Sequence[Any] | NDArray) -> None:
+        """Ask all workers, each with its agents' part of the `(n,)` values."""
+        self._send(method, {worker: ((values[worker :: self._count],), {}) for worker in self._workers})
+
+    def _receive(self) -> dict[int, Any]:
+        """Answers by the worker's number; the first that is an error is raised with the worker and its scene."""
+        answers = self._answers()
+        for worker, answer in answers.items():
+            if isinstance(answer, Exception):
+                raise type(answer)(f"{answer} [{self._name(worker)}]")
+        return answers
+
+    def _answers(self) -> dict[int, Any]:
+        answers = {}
+        while self._asked:
+            with self._named_death(self._asked[0]):
+                answers[self._asked[0]] = self.remotes[self._asked[0]].recv()
+            del self._asked[0]
+        return answers
+
+    @contextmanager
+    def _named_death(self, worker: int, hint: str = "") -> Iterator[None]:
+        """Within the block, a broken pipe becomes an error that names the worker; the others are ended, too."""
+        try:
+            yield
+        except _GONE:
+            how = _how_it_ended(self.processes[worker])
+            self.close()
+            raise SimulatorError(f"{self._name(worker)} {how}; the other workers were ended{hint}") from None
+
+    def _name(self, worker: int) -> str:
+        return f"worker {worker} of {self._count} (scene {self.scenes[worker % len(self.scenes)]})"
+
+    def _joined(self, *arrays: NDArray) -> NDArray:
         joined = np.empty((self.num_envs, *arrays[0].shape[1:]), arrays[0].dtype)
         for worker, array in enumerate(arrays):
             joined[worker :: self._count] = array
         return joined
 
 
-@contextmanager
-def _ended_by_errors(env: AVPSubprocVecEnv) -> Iterator[None]:
-    """A step or reset that failed leaves agents of different times: nothing can go on from there."""
-    try:
-        yield
-    except (AVPError, AttributeError):
-        env.close()
-        raise
+def _how_it_ended(process: BaseProcess) -> str:
+    """The end of a process whose pipe is broken, as a phrase: by which signal, or with which exit code."""
+    process.join(_GRACE_S)
+    code = process.exitcode
+    if code is None:
+        return "does not answer any more"
+    if code >= 0:
+        return f"ended with exit code {code}; what it said last stands above"
+    name = signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
+    return f"was killed by {name}{_HINTS.get(name, '')}"
 
 
-def _workers(workers: int | None, scenes: int) -> int:
-    if workers is None:
-        return scenes
-    if workers < 1 or workers % scenes:
-        there_are = "there is 1 scene" if scenes == 1 else f"there are {scenes} scenes"
-        raise UsageError(f"workers: expected {scenes} or a multiple of it, as {there_are}, got {workers}")
-    return workers
+def _end(processes: Sequence[BaseProcess]) -> None:
+    """Wait for processes whose pipes are closed, and end those that have not ended after a while."""
+    for stop in (None, "terminate", "kill"):
+        late = [process for process in processes if process.is_alive()]
+        for process in late if stop else []:
+            getattr(process, stop or "")()
+        until = time.monotonic() + _GRACE_S
+        for process in late:
+            process.join(max(0.0, until - time.monotonic()))

@@ -1,13 +1,13 @@
 """Furniture that belongs together, arranged relative to one another."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
-from avp_habitat.scenes.builtin import decor, seating, storage
+from avp_habitat.scenes.builtin import decor, seating
 from avp_habitat.scenes.builtin.kit import Kit, Piece, shifted
-from avp_habitat.scenes.builtin.random import Dice
-from avp_habitat.scenes.builtin.shapes import Material, Rectangle, Surface, box, yawed
+from avp_habitat.scenes.builtin.noise import Random
+from avp_habitat.scenes.builtin.shapes import HALF_TURN, Material, Rectangle, box, yawed
 
 GAP_M = 0.03
 """Between furniture and the wall behind it: the skirting board is 15 mm thick."""
@@ -15,14 +15,11 @@ GAP_M = 0.03
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """A piece in a group; the group's frame has its back at z = 0 and its front towards +z."""
+    """A piece in a group, whose frame has its back at z = 0 and its front towards +z; x is to the right, metres."""
 
     piece: Piece
-    """What."""
     x: float
-    """Metres to the right of the middle, for somebody who looks along -z at the group's back."""
     z: float
-    """Metres in front of the back."""
     quarter: int = 0
     """Quarter turns about +Y, counter-clockwise from above."""
     twist: float = 0.0
@@ -34,7 +31,6 @@ class Group:
     """Pieces with fixed places relative to one another."""
 
     members: tuple[Member, ...]
-    """The pieces."""
     clear: tuple[Rectangle, ...] = ()
     """x0, z0, x1, z1 in front of furniture that people need to use it."""
 
@@ -51,14 +47,13 @@ def against_wall(piece: Piece, clear: float) -> Arrange:
     return lambda depth: group if depth > front + clear else None
 
 
-def living(kit: Kit, dice: Dice) -> list[Arrange]:
+def living(kit: Kit, rng: Random) -> list[Arrange]:
     """A television and a sofa that faces it over a coffee table on a rug; the fullest arrangement comes first."""
-    unit, couch = storage.television(kit, dice), seating.sofa(kit, dice)
-    table, carpet = seating.coffee_table(kit, dice), decor.rug(kit, 2.3, 1.6)
-    seat, beside, lamp = seating.armchair(kit, dice), seating.side_table(kit, dice), decor.floor_lamp(kit, dice)
-    side, twist = dice.pick((-1, 1)), dice.number(-0.2, 0.2)
-    free = dice.number(3.3, 3.8)
-
+    unit, couch = decor.television(kit, rng), seating.sofa(kit, rng)
+    table, carpet = seating.coffee_table(kit, rng), decor.rug(kit, 2.3, 1.6)
+    seat, beside, lamp = seating.armchair(kit, rng), seating.side_table(kit, rng), decor.floor_lamp(kit, rng)
+    side, twist = rng.choice((-1, 1)), rng.uniform(-0.2, 0.2)
+    free = rng.uniform(3.3, 3.8)
     seat_x = side * max(couch.width / 2 + 0.15, table.width / 2 + 0.16 + seat.depth * 0.6)
 
     def members(back: float) -> list[Member]:
@@ -84,42 +79,42 @@ def living(kit: Kit, dice: Dice) -> list[Arrange]:
     return [lambda depth, count=count: arrange(depth, count) for count in (7, 6, 5, 4)]
 
 
-def dining(kit: Kit, dice: Dice) -> Arrange:
+def dining(kit: Kit, rng: Random) -> Arrange:
     """A table with chairs around it, sometimes on a rug; needs free floor on all sides."""
-    wood: Material = dice.pick((kit.wood, kit.dark_wood))
+    wood: Material = rng.choice((kit.wood, kit.dark_wood))
     members: list[Member] = []
-    if dice.chance(0.35):
-        radius = dice.number(0.5, 0.6)
-        table = seating.round_table(kit, dice, radius)
+    if rng.chance(0.35):
+        radius = rng.uniform(0.5, 0.6)
+        table = seating.round_table(kit, rng, radius)
         half_x = half_z = radius + 0.32
         for quarter, (x, z) in enumerate(((0, -1), (-1, 0), (0, 1), (1, 0))):
-            one = seating.chair(kit, dice, wood)
-            members.append(Member(one, x * half_x, z * half_z, (0, 1, 2, 3)[quarter], dice.number(-0.12, 0.12)))
+            one = seating.chair(kit, rng, wood)
+            members.append(Member(one, x * half_x, z * half_z, quarter, rng.uniform(-0.12, 0.12)))
     else:
-        pairs = dice.pick((2, 2, 3))
-        table = seating.dining_table(kit, dice, 0.62 * pairs + 0.2, 0.85)
+        pairs = rng.choice((2, 2, 3))
+        table = seating.dining_table(kit, rng, 0.62 * pairs + 0.2, 0.85)
         half_x, half_z = table.width / 2, table.depth / 2 + 0.3
         for index in range(pairs):
             x = (index - (pairs - 1) / 2) * 0.62
             for quarter, z in ((0, -half_z), (2, half_z)):
-                one = seating.chair(kit, dice, wood)
-                members.append(Member(one, x, z, quarter, dice.number(-0.1, 0.1)))
+                one = seating.chair(kit, rng, wood)
+                members.append(Member(one, x, z, quarter, rng.uniform(-0.1, 0.1)))
     reach = half_z + 0.4
-    members = [Member(m.piece, m.x, m.z + reach, m.quarter, m.twist) for m in members]
+    members = [replace(member, z=member.z + reach) for member in members]
     members.append(Member(table, 0.0, reach))
-    if dice.chance(0.5):
+    if rng.chance(0.5):
         members.append(Member(decor.rug(kit, 2 * half_x + 0.7, 2 * half_z + 0.5), 0.0, reach))
     group = Group(tuple(members))
     return lambda depth: group if depth > 2 * reach else None
 
 
-def sleeping(kit: Kit, dice: Dice) -> Arrange:
+def sleeping(kit: Kit, rng: Random) -> Arrange:
     """A bed with its head to the wall, one or two night stands and a rug beside it."""
-    couch = seating.bed(kit, dice)
-    stands = [seating.side_table(kit, dice) for _ in range(2)]
+    couch = seating.bed(kit, rng)
+    stands = [seating.side_table(kit, rng) for _ in range(2)]
     z = GAP_M + couch.depth / 2
     members = [Member(couch, 0.0, z)]
-    sides = (-1, 1) if couch.width > 1.2 else (dice.pick((-1, 1)),)
+    sides = (-1, 1) if couch.width > 1.2 else (rng.choice((-1, 1)),)
     for stand, side in zip(stands, sides, strict=False):
         members.append(Member(stand, side * (couch.width / 2 + 0.26), GAP_M + stand.depth / 2))
     members.append(Member(decor.rug(kit, 1.0, 1.5), sides[0] * (couch.width / 2 + 0.55), 1.5))
@@ -129,39 +124,37 @@ def sleeping(kit: Kit, dice: Dice) -> Arrange:
     return lambda depth: group if depth > couch.depth + 0.7 else None
 
 
-def working(kit: Kit, dice: Dice) -> Arrange:
+def working(kit: Kit, rng: Random) -> Arrange:
     """A desk against the wall and a swivel chair before it."""
-    table, stool = seating.desk(kit, dice), seating.office_chair(kit, dice)
+    table, stool = seating.desk(kit, rng), seating.office_chair(kit, rng)
     z = GAP_M + table.depth / 2
-    group = Group(
-        (Member(table, 0.0, z), Member(stool, -0.1, GAP_M + table.depth + 0.42, 2, dice.number(-0.4, 0.4))),
-        ((-0.5, 0.7, 0.5, 1.6),),
-    )
+    chair = Member(stool, -0.1, GAP_M + table.depth + 0.42, 2, rng.uniform(-0.4, 0.4))
+    group = Group((Member(table, 0.0, z), chair), ((-0.5, 0.7, 0.5, 1.6),))
     return lambda depth: group if depth > 1.7 else None
 
 
-def reading(kit: Kit, dice: Dice) -> list[Arrange]:
+def reading(kit: Kit, rng: Random) -> list[Arrange]:
     """An armchair with a floor lamp and, where there is room, a pouf."""
-    seat, lamp, stool = seating.armchair(kit, dice), decor.floor_lamp(kit, dice), seating.pouf(kit, dice)
-    side = dice.pick((-1, 1))
+    seat, lamp, stool = seating.armchair(kit, rng), decor.floor_lamp(kit, rng), seating.pouf(kit, rng)
+    side = rng.choice((-1, 1))
     members = (
-        Member(seat, 0.0, 0.12 + seat.depth / 2, 0, dice.number(-0.25, 0.25)),
+        Member(seat, 0.0, 0.12 + seat.depth / 2, 0, rng.uniform(-0.25, 0.25)),
         Member(lamp, side * (seat.width / 2 + 0.34), 0.3),
         Member(stool, 0.0, 0.12 + seat.depth + 0.45),
     )
     return [lambda depth, count=count: Group(members[:count]) if depth > 1.8 else None for count in (3, 2)]
 
 
-def divider(kit: Kit, dice: Dice, ceiling: float) -> list[Arrange]:
+def divider(kit: Kit, rng: Random, ceiling: float) -> list[Arrange]:
     """A partition wall or double shelf that runs from a wall into the room to hide what is behind it, longest first."""
-    masonry = dice.chance(0.5)
-    wall = dice.pick((kit.feature_wall, kit.papered_wall))
+    masonry = rng.chance(0.5)
+    wall = rng.choice((kit.feature_wall, kit.papered_wall))
     lengths = (2.3, 1.9, 1.5, 1.2)
-    gap, dice = (-0.02, dice.child()) if masonry else (GAP_M, dice.child())
+    gap, rng = (-0.02, rng.spawn()) if masonry else (GAP_M, rng.spawn())
 
     @cache
     def piece(length: float) -> Piece:
-        return partition(kit, dice, wall, length, ceiling) if masonry else storage.divider_shelf(kit, dice, length)
+        return partition(kit, rng, wall, length, ceiling) if masonry else decor.divider_shelf(kit, rng, length)
 
     def arrange(depth: float, length: float) -> Group | None:
         if depth - length < 1.1 or length > 0.62 * depth:
@@ -171,17 +164,15 @@ def divider(kit: Kit, dice: Dice, ceiling: float) -> list[Arrange]:
     return [lambda depth, length=length: arrange(depth, length) for length in lengths]
 
 
-def partition(kit: Kit, dice: Dice, material: Material, length: float, ceiling: float) -> Piece:
+def partition(kit: Kit, rng: Random, material: Material, length: float, ceiling: float) -> Piece:
     """A stub of wall along x with a skirting board and a picture on each side."""
     thick = 0.12
-    made: list[Surface] = box(
-        (length, ceiling, thick), (0, ceiling / 2, 0), material, faces=("front", "back"), pitch=0.25
-    )
-    made += box((length, ceiling, thick), (0, ceiling / 2, 0), kit.trim, faces=("left", "right"), pitch=0.25)
-    made += box(
-        (length - 0.008, 0.09, thick + 0.03), (0, 0.045, 0), kit.trim, faces=("front", "back", "left", "right", "top")
-    )
-    wide = min(length - 0.5, dice.number(0.6, 0.9))
-    front = shifted(decor.picture(kit, dice, wide, 0.62), 0, 1.55, thick / 2)
-    back = yawed(shifted(decor.picture(kit, dice, wide * 0.8, 0.7), 0, 1.55, thick / 2), 3.14159265)
+    size, middle = (length, ceiling, thick), (0, ceiling / 2, 0)
+    made = box(size, middle, material, faces=("front", "back"), pitch=0.25)
+    made += box(size, middle, kit.trim, faces=("left", "right"), pitch=0.25)
+    sides = ("front", "back", "left", "right", "top")
+    made += box((length - 0.008, 0.09, thick + 0.03), (0, 0.045, 0), kit.trim, faces=sides)
+    wide = min(length - 0.5, rng.uniform(0.6, 0.9))
+    front = shifted(decor.picture(kit, rng, wide, 0.62), 0, 1.55, thick / 2)
+    back = yawed(shifted(decor.picture(kit, rng, wide * 0.8, 0.7), 0, 1.55, thick / 2), HALF_TURN)
     return Piece("partition", made + front + back, length, thick + 0.07, ceiling)

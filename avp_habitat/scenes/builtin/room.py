@@ -1,179 +1,31 @@
-"""Furnished rooms that are made up from a number: `builtin:SEED`."""
+"""Furnished rooms that are made up from a number, `builtin:SEED`, with light baked into their vertices."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from avp_habitat.errors import UsageError
-from avp_habitat.scenes.builtin import decor, groups, seating, storage
-from avp_habitat.scenes.builtin.floorplan import Floor, Placed, places, stand_at
-from avp_habitat.scenes.builtin.groups import Arrange, Member
-from avp_habitat.scenes.builtin.kit import Kit, Lamp, Piece, shifted
-from avp_habitat.scenes.builtin.lighting import bake
-from avp_habitat.scenes.builtin.random import Dice
-from avp_habitat.scenes.builtin.shapes import Surface, joined
-from avp_habitat.scenes.builtin.shell import Shell, Wall, build_shell, plan_shell
+from avp_habitat.scenes.builtin.furnish import Placed, furnish
+from avp_habitat.scenes.builtin.kit import Kit, Lamp
+from avp_habitat.scenes.builtin.noise import Random
+from avp_habitat.scenes.builtin.shapes import Float, Surface, joined
+from avp_habitat.scenes.builtin.shell import Shell, build_shell, plan_shell
 from avp_habitat.scenes.mesh import TexturedMesh, merge
-
-PICTURES = ((0.9, 0.65), (0.5, 0.7), (0.6, 0.85), (0.7, 0.5), (1.2, 0.8))
-"""Widths and heights of frames in metres."""
-MIDDLE_M = 1.6
-"""Height at which the middle of a picture hangs."""
-
-
-def _hang_one(floor: Floor, dice: Dice, kit: Kit, wall: Wall, right: float, *, clock: bool) -> bool:
-    """Hang a picture or clock at a place on a wall if nothing is in its way."""
-    width, height = (0.34, 0.34) if clock else dice.pick(PICTURES)
-    low, high = MIDDLE_M - height / 2, MIDDLE_M + height / 2
-    stand = stand_at(Member(Piece("", [], width, 0.06, high), 0.0, 0.03), wall, right, 0.0)
-    if not floor.is_free(stand, low, high, 0.1):
-        return False
-    surfaces = decor.clock(kit) if clock else decor.picture(kit, dice, width, height)
-    piece = Piece("clock" if clock else "picture", shifted(surfaces, 0.0, MIDDLE_M, -0.03), width, 0.06, high)
-    floor.hang(Placed(piece, stand.axes, stand.position, stand.footprint), low, high)
-    return True
-
-
-def hang_pictures(floor: Floor, dice: Dice, kit: Kit) -> None:
-    """Pictures on every wall that has room for them, one clock in some rooms."""
-    clock = dice.chance(0.6)
-    for wall in dice.shuffled(floor.shell.walls):
-        wanted = 3 if wall.length > 3 else 1
-        for right in dice.shuffled(places(0.5, wall.length - 0.4, 0.2)):
-            if wanted and _hang_one(floor, dice, kit, wall, right, clock=clock):
-                wanted, clock = wanted - 1, False
-
-
-def hang_lamp(floor: Floor, dice: Dice, kit: Kit) -> None:
-    """A pendant above the dining table, or where the room is open."""
-    shell = floor.shell
-    tables = [stand.position for stand in floor.placed if stand.piece.kind == "dining table"]
-    x0, z0, x1, z1 = shell.bounds
-    bottom = min(2.1, round(shell.ceiling - 0.62, 2))
-    piece = decor.pendant(kit, dice, shell.ceiling, bottom)
-    half = piece.width / 2
-    for x, z in tables or [((x0 + x1) / 2 + 0.1, (z0 + z1) / 2), (x0 + 1.2, z0 + 1.2), (x1 - 1.2, z1 - 1.2)]:
-        stand = Placed(piece, np.eye(3), (x, z), (x - half, z - half, x + half, z + half))
-        if floor.is_free(stand, bottom - 0.05, shell.ceiling, 0.03):
-            floor.hang(stand, bottom - 0.05, shell.ceiling)
-            return
-
-
-Spot = tuple[Wall, float, float]
-"""A wall, metres along it and metres in front of it."""
-
-MAIN, EXTRA, SMALL = 0.45, 0.42, 0.41
-"""Share of the floor that stays walkable after placing main groups, storage, and what fills corners."""
-
-
-def _put(floor: Floor, arrange: Arrange, spots: Iterable[Spot], least_share: float) -> bool:
-    """Place a group at the first spot where it fits and leaves enough of the floor walkable."""
-    for wall, right, inwards in spots:
-        group = arrange(floor.shell.depth_at(wall, right) - inwards)
-        if group is not None and floor.try_group(group, wall, right, inwards, least_share=least_share):
-            return True
-    return False
-
-
-def _at_walls(floor: Floor, dice: Dice) -> Iterator[Spot]:
-    """Places along all walls in random order."""
-    for wall in dice.shuffled(floor.shell.walls):
-        for right in dice.shuffled(places(0.3, wall.length - 0.3, 0.2)):
-            yield wall, right, 0.0
-
-
-def _in_corners(floor: Floor, dice: Dice, distance: float) -> Iterator[Spot]:
-    """Places at walls, a distance in metres from their ends, in random order."""
-    for wall in dice.shuffled(floor.shell.walls):
-        for right in dice.shuffled([distance, wall.length - distance]):
-            yield wall, right, 0.0
-
-
-def _anywhere(floor: Floor, dice: Dice) -> Iterator[Spot]:
-    """Places in the open floor in random order."""
-    for wall in dice.shuffled(floor.shell.walls):
-        spots = [(r, i) for r in places(0.6, wall.length - 0.5, 0.3) for i in places(0.1, 4.0, 0.3)]
-        for right, inwards in dice.shuffled(spots)[:120]:
-            yield wall, right, inwards
-
-
-def _across(floor: Floor, dice: Dice) -> Iterator[Spot]:
-    """Places at long walls, away from their ends, in random order."""
-    for wall in dice.shuffled([wall for wall in floor.shell.walls if wall.length >= 3.0]):
-        for share in dice.shuffled([0.3, 0.36, 0.43, 0.5, 0.57, 0.64, 0.7]):
-            yield wall, round(wall.length * share, 2), 0.0
-
-
-def _storage(kit: Kit, dice: Dice) -> list[Arrange]:
-    """Tall and low furniture for walls, the second shelf and chest last."""
-    first = [
-        groups.against_wall(storage.bookshelf(kit, dice), 0.55),
-        groups.against_wall(storage.wardrobe(kit, dice), 0.6),
-        groups.against_wall(storage.drawers(kit, dice), 0.5),
-    ]
-    second = [
-        groups.against_wall(storage.bookshelf(kit, dice), 0.55),
-        groups.against_wall(storage.drawers(kit, dice), 0.5),
-    ]
-    return dice.shuffled(first) + second
-
-
-def _put_living(floor: Floor, dice: Dice, kit: Kit) -> bool:
-    """Sofa, television and what belongs to them, as much as fits."""
-    return any(_put(floor, arrange, _at_walls(floor, dice), MAIN) for arrange in groups.living(kit, dice))
-
-
-def _put_main_groups(floor: Floor, dice: Dice, kit: Kit) -> None:
-    """What the room is for, by its size, and what parts it."""
-    area = floor.shell.floor_area
-    sleeps = dice.chance(0.6 if area > 22 else 0.4)
-    sits = area > 20 or not sleeps
-    sits = sits and _put_living(floor, dice, kit)
-    sleeps = (sleeps or not sits) and _put(floor, groups.sleeping(kit, dice), _at_walls(floor, dice), MAIN)
-    if not sits and not sleeps:
-        sits = _put_living(floor, dice, kit)
-    if not (sits and sleeps) or area > 30:
-        _put(floor, groups.dining(kit, dice), _anywhere(floor, dice), MAIN)
-    any(_put(floor, arrange, _across(floor, dice), MAIN) for arrange in groups.divider(kit, dice, floor.shell.ceiling))
-
-
-def _put_the_rest(floor: Floor, dice: Dice, kit: Kit) -> None:
-    """Desk, storage, a place to read, and what fills corners, as long as the floor stays walkable."""
-    first, *rest = _storage(kit, dice)
-    for arrange in (groups.working(kit, dice), first):
-        _put(floor, arrange, _at_walls(floor, dice), EXTRA)
-    any(_put(floor, arrange, _at_walls(floor, dice), EXTRA) for arrange in groups.reading(kit, dice))
-    for arrange in rest:
-        _put(floor, arrange, _at_walls(floor, dice), EXTRA)
-    for _ in range(2):
-        _put(floor, groups.against_wall(decor.plant(kit, dice), 0.0), _in_corners(floor, dice, 0.42), SMALL)
-    if sum(stand.piece.kind == "side table" for stand in floor.placed) < 2:
-        _put(floor, groups.against_wall(seating.side_table(kit, dice), 0.3), _at_walls(floor, dice), SMALL)
-
-
-def furnish(shell: Shell, dice: Dice, kit: Kit) -> list[Placed]:
-    """Furniture of a room, none of it in another's place, the door free, the floor walkable and in one part."""
-    floor = Floor(shell)
-    _put_main_groups(floor, dice, kit)
-    _put_the_rest(floor, dice, kit)
-    hang_lamp(floor, dice, kit)
-    hang_pictures(floor, dice, kit)
-    return floor.placed
-
 
 GENERATOR_VERSION = 1
 """Rises whenever a seed's room changes, so that results name the room that they were measured in."""
+_VOXEL_M = 0.1
+_PADDING = 8
+"""Voxels around the room that count as solid."""
+_OFF_THE_GRID = 3.7e-5
+"""Metres by which voxels are shifted, so that no wall lies exactly between two of them."""
 
 
-def _checked(seed: int) -> int:
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise UsageError(f"builtin:{seed}: expected a whole number of 0 or greater as the room's seed, got {seed!r}")
-    return int(seed)
-
-
-def plan_room(seed: int) -> tuple[Shell, list[Placed]]:
-    """The empty room and its furniture, before light is baked.
+def plan_room(seed: int) -> tuple[Kit, Shell, list[Placed]]:
+    """What a room is made of, the empty room and its furniture, before light is baked.
 
     Args:
         seed: 0 or greater.
@@ -181,9 +33,11 @@ def plan_room(seed: int) -> tuple[Shell, list[Placed]]:
     Raises:
         UsageError: the seed is not a whole number of 0 or greater.
     """
-    seed = _checked(seed)
-    shell = plan_shell(Dice(seed, 1))
-    return shell, furnish(shell, Dice(seed, 2), Kit(seed))
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise UsageError(f"builtin:{seed}: expected a whole number of 0 or greater as the room's seed, got {seed!r}")
+    seed = int(seed)
+    kit, shell = Kit(seed), plan_shell(Random(seed, 1))
+    return kit, shell, furnish(shell, Random(seed, 2), kit)
 
 
 def _snapped(values: np.ndarray) -> np.ndarray:
@@ -206,11 +60,6 @@ def _mesh(surface: Surface, colours: np.ndarray) -> TexturedMesh:
     )
 
 
-def _in_world(stand: Placed, lamp: Lamp) -> Lamp:
-    x, y, z = stand.axes @ np.asarray(lamp.position) + [stand.position[0], 0.0, stand.position[1]]
-    return Lamp((float(x), float(y), float(z)), lamp.strength)
-
-
 def generate_room(seed: int) -> TexturedMesh:
     """A furnished room: metres, Y up, floor at y = 0, closed on all sides, the same for the same seed.
 
@@ -220,15 +69,116 @@ def generate_room(seed: int) -> TexturedMesh:
     Raises:
         UsageError: the seed is not a whole number of 0 or greater.
     """
-    seed = _checked(seed)
-    kit = Kit(seed)
-    shell = plan_shell(Dice(seed, 1))
-    placed = furnish(shell, Dice(seed, 2), kit)
-    surfaces = build_shell(kit, Dice(seed, 3), shell)
-    lamps = []
+    kit, shell, placed = plan_room(seed)
+    surfaces = build_shell(kit, Random(int(seed), 3), shell)
     for stand in placed:
         surfaces += stand.surfaces()
-        lamps += [_in_world(stand, lamp) for lamp in stand.piece.lamps]
+    lamps = [lamp for stand in placed for lamp in stand.lamps()]
     surfaces = [replace(s, vertices=_snapped(s.vertices), uv=_snapped(s.uv)) for s in joined(surfaces)]
-    colours = bake(shell, surfaces, lamps)
+    colours = _bake(shell, surfaces, lamps)
     return merge([_mesh(surface, colour) for surface, colour in zip(surfaces, colours, strict=True)])
+
+
+class _Voxels:
+    """What of the room's space is filled, and how filled the surroundings of each place are."""
+
+    def __init__(self, shell: Shell, surfaces: list[Surface]) -> None:
+        """Fill every voxel that a surface passes through and everything outside the room."""
+        x0, z0, x1, z1 = shell.bounds
+        self._origin = np.array([x0, 0.0, z0]) - _PADDING * _VOXEL_M - _OFF_THE_GRID
+        extent = np.array([x1 - x0, shell.ceiling, z1 - z0])
+        shape = tuple(int(n) for n in np.ceil(extent / _VOXEL_M) + 2 * _PADDING)
+        filled = np.ones(shape, np.float32)
+        inside = [np.arange(n) * _VOXEL_M + _VOXEL_M / 2 - _PADDING * _VOXEL_M for n in shape]
+        room = [(along > 0) & (along < extent[axis]) for axis, along in enumerate(inside)]
+        filled[np.ix_(*room)] = 0
+        if shell.notch is not None:
+            a, b, c, d = shell.notch
+            x, z = inside[0] + x0, inside[2] + z0
+            filled[np.ix_((x > a) & (x < c), room[1], (z > b) & (z < d))] = 1
+        self.solid = filled
+        for surface in surfaces:
+            index = self._index(_samples(surface))
+            filled[index[:, 0], index[:, 1], index[:, 2]] = 1
+        self.soft = {reach: uniform_filter(filled, 2 * reach + 1, mode="nearest") for reach in (1, 2, 4, 7)}
+
+    def _index(self, points: Float) -> NDArray[np.int64]:
+        index = np.floor((points - self._origin) / _VOXEL_M).astype(np.int64)
+        return np.clip(index, 0, np.array(self.solid.shape) - 1)
+
+    def fullness(self, points: Float, reach: int) -> NDArray[np.float32]:
+        """Trilinear share of filled space within `reach` voxels of `(n, 3)` points."""
+        grid = self.soft[reach]
+        place = np.clip((points - self._origin) / _VOXEL_M - 0.5, 0, np.array(grid.shape) - 1.001)
+        low = np.floor(place).astype(np.int64)
+        part = (place - low).astype(np.float32)
+        total = np.zeros(len(points), np.float32)
+        for corner in range(8):
+            bits = np.array([corner >> 2 & 1, corner >> 1 & 1, corner & 1])
+            weight = np.prod(np.where(bits, part, 1 - part), axis=1)
+            at = low + bits
+            total += weight * grid[at[:, 0], at[:, 1], at[:, 2]]
+        return total
+
+    def clear_view(self, points: Float, light: Float, steps: int = 14) -> NDArray[np.float32]:
+        """Share of light that reaches `(n, 3)` points from a `(3,)` point past what is filled."""
+        grid = self.soft[1]
+        through = np.ones(len(points), np.float32)
+        for step in range(1, steps):
+            at = self._index(points + (light - points) * (step / steps))
+            through *= 1 - 0.55 * grid[at[:, 0], at[:, 1], at[:, 2]]
+        return through
+
+
+def _samples(surface: Surface) -> Float:
+    """Points on the triangles, close enough together to fill every voxel that they pass through."""
+    corners = surface.vertices[surface.triangles]
+    weights = np.array([[i, j, 4 - i - j] for i in range(5) for j in range(5 - i)]) / 4
+    return np.einsum("kc,tcd->tkd", weights, corners).reshape(-1, 3)
+
+
+def _open_sky(voxels: _Voxels, points: Float, normals: Float) -> NDArray[np.float32]:
+    """How unobstructed the half space above each point is, 0 to 1."""
+    openness = np.ones(len(points), np.float32)
+    for reach, weight in ((1, 0.22), (2, 0.3), (4, 0.32), (7, 0.34)):
+        openness -= np.float32(weight) * voxels.fullness(points + normals * (reach + 0.6) * _VOXEL_M, reach)
+    return np.clip(openness, 0.3, 1)
+
+
+def _from_lamp(voxels: _Voxels, points: Float, normals: Float, position: Float, reach: float) -> NDArray[np.float32]:
+    """Light of a point source: falls off with distance and slant, shadowed softly."""
+    offset = position - points
+    square = (offset * offset).sum(axis=1)
+    slant = (offset * normals).sum(axis=1) / np.sqrt(square + 1e-6)
+    falloff = np.clip(slant * 0.8 + 0.2, 0, 1) / (1 + square / reach**2)
+    return (falloff * voxels.clear_view(points + normals * 1.6 * _VOXEL_M, position)).astype(np.float32)
+
+
+def _windows(shell: Shell) -> Iterator[tuple[Float, float]]:
+    """Points of light just inside each window and their strength."""
+    for hole in shell.openings:
+        if hole.kind == "window":
+            wall, width = shell.walls[hole.wall], hole.right - hole.left
+            for share in (0.25, 0.75):
+                x, z = wall.point(hole.left + width * share, 0.3)
+                yield np.array([x, (hole.bottom + hole.top) / 2 + 0.2, z]), 0.3 * width
+
+
+def _bake(shell: Shell, surfaces: list[Surface], lamps: list[Lamp]) -> list[NDArray[np.float32]]:
+    """`(v, 3)` light in [0, 1] on each surface, from windows and lamps; all is in the world frame."""
+    voxels = _Voxels(shell, surfaces)
+    points, normals = (np.concatenate([getattr(each, name) for each in surfaces]) for name in ("vertices", "normals"))
+    openness = _open_sky(voxels, points, normals)
+    ambient = openness * (0.76 + 0.05 * normals[:, 1]).astype(np.float32)
+    light = ambient[:, None] * np.array([1.0, 0.99, 0.97], np.float32)
+    for position, strength in _windows(shell):
+        daylight = _from_lamp(voxels, points, normals, position, 2.4) * np.float32(strength)
+        light += daylight[:, None] * np.array([0.97, 1.0, 1.04], np.float32)
+    for lamp in lamps:
+        warm = _from_lamp(voxels, points, normals, np.asarray(lamp.position), 0.9) * np.float32(lamp.strength)
+        light += warm[:, None] * np.array([1.05, 0.92, 0.7], np.float32)
+    light = np.where(light > 0.8, 0.8 + (light - 0.8) * 0.45, light)
+    parts = np.split(np.clip(light, 0, 1), np.cumsum([len(surface.vertices) for surface in surfaces])[:-1])
+    return [
+        np.ones_like(part) if surface.material.glows else part for surface, part in zip(surfaces, parts, strict=True)
+    ]

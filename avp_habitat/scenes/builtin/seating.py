@@ -1,8 +1,8 @@
-"""Tables and what stands on them."""
+"""Seats, beds and tables with what stands on them."""
 
+from avp_habitat.scenes.builtin.decor import book_stack, bowl, table_lamp, vase
 from avp_habitat.scenes.builtin.kit import Kit, Lamp, Piece, shifted
-from avp_habitat.scenes.builtin.pictures import SPINES, spine_cell
-from avp_habitat.scenes.builtin.random import Dice
+from avp_habitat.scenes.builtin.noise import Random
 from avp_habitat.scenes.builtin.shapes import Material, Surface, box, cushion, cylinder, lathe, leaned, yawed
 
 SEAT_M = 0.46
@@ -17,17 +17,17 @@ def _legs(width: float, depth: float, height: float, side: float, material: Mate
     return made
 
 
-def _pillow(kit: Kit, dice: Dice, x: float, y: float, z: float, lean: float = -0.3) -> list[Surface]:
+def _pillow(kit: Kit, rng: Random, x: float, y: float, z: float, lean: float = -0.3) -> list[Surface]:
     """A loose pillow that leans back; (x, y, z) is where its lower edge rests."""
-    side = dice.number(0.36, 0.46)
-    made = shifted(cushion((side, side, 0.1), (0, 0, 0), 0.05, dice.pick(kit.cushions), puff=0.03), 0, side / 2, 0)
-    return yawed(leaned(made, lean), dice.number(-0.25, 0.25), (x, y, z))
+    side = rng.uniform(0.36, 0.46)
+    made = shifted(cushion((side, side, 0.1), (0, 0, 0), 0.05, rng.choice(kit.cushions), puff=0.03), 0, side / 2, 0)
+    return yawed(leaned(made, lean), rng.uniform(-0.25, 0.25), (x, y, z))
 
 
-def _padded(kit: Kit, dice: Dice, width: float, seats: int, cloth: Material, kind: str) -> Piece:
+def _padded(kit: Kit, rng: Random, width: float, seats: int, cloth: Material, kind: str) -> Piece:
     """A sofa or armchair with the given number of seats."""
-    depth, arm, back = 0.9, dice.number(0.14, 0.2), 0.2
-    high, arm_high = dice.number(0.8, 0.92), dice.number(0.56, 0.66)
+    depth, arm, back = 0.9, rng.uniform(0.14, 0.2), 0.2
+    high, arm_high = rng.uniform(0.8, 0.92), rng.uniform(0.56, 0.66)
     made = _legs(width - 0.1, depth - 0.1, 0.1, 0.06, kit.dark_wood)
     made += cushion((width - 2 * arm, 0.2, depth - 0.04), (0, 0.2, 0), 0.03, cloth)
     made += cushion((width - 0.02, high - 0.1, back), (0, 0.1 + (high - 0.1) / 2, -depth / 2 + back / 2), 0.07, cloth)
@@ -42,33 +42,30 @@ def _padded(kit: Kit, dice: Dice, width: float, seats: int, cloth: Material, kin
     places = [-1, 1] if seats > 1 else [0]
     for side in places:
         x = side * (width / 2 - arm - 0.26)
-        made += _pillow(kit, dice, x, 0.47, -depth / 2 + back + 0.3)
+        made += _pillow(kit, rng, x, 0.47, -depth / 2 + back + 0.3)
     return Piece(kind, made, width, depth, max(high, 0.95))
 
 
-def sofa(kit: Kit, dice: Dice) -> Piece:
+def sofa(kit: Kit, rng: Random) -> Piece:
     """Two or three seats with loose pillows."""
-    seats = dice.pick((2, 3, 3))
-    return _padded(
-        kit, dice, dice.number(1.65, 1.85) if seats == 2 else dice.number(2.0, 2.3), seats, kit.upholstery, "sofa"
-    )
+    seats = rng.choice((2, 3, 3))
+    width = rng.uniform(1.65, 1.85) if seats == 2 else rng.uniform(2.0, 2.3)
+    return _padded(kit, rng, width, seats, kit.upholstery, "sofa")
 
 
-def armchair(kit: Kit, dice: Dice) -> Piece:
+def armchair(kit: Kit, rng: Random) -> Piece:
     """One padded seat."""
-    return _padded(kit, dice, dice.number(0.82, 0.92), 1, kit.second_cloth, "armchair")
+    return _padded(kit, rng, rng.uniform(0.82, 0.92), 1, kit.second_cloth, "armchair")
 
 
-def chair(kit: Kit, dice: Dice, material: Material) -> Piece:
+def chair(kit: Kit, rng: Random, material: Material) -> Piece:
     """A dining chair with a slatted or padded back."""
     width, depth, high = 0.44, 0.46, 0.9
     made = _legs(width, depth, SEAT_M - 0.04, 0.04, material)
     made += cushion((width, 0.06, depth), (0, SEAT_M - 0.01, 0), 0.02, kit.second_cloth)
-    for side in (-1, 1):
-        made += box(
-            (0.04, high - SEAT_M, 0.04), (side * 0.2, (high + SEAT_M) / 2, -depth / 2 + 0.02), material, pitch=1
-        )
-    if dice.chance(0.5):
+    for x in (-0.2, 0.2):
+        made += box((0.04, high - SEAT_M, 0.04), (x, (high + SEAT_M) / 2, -depth / 2 + 0.02), material, pitch=1)
+    if rng.chance(0.5):
         made += cushion((0.36, 0.3, 0.04), (0, 0.72, -depth / 2 + 0.025), 0.018, kit.second_cloth)
     else:
         for place in (0.62, 0.73, 0.84):
@@ -76,7 +73,7 @@ def chair(kit: Kit, dice: Dice, material: Material) -> Piece:
     return Piece("chair", made, width, depth, high)
 
 
-def office_chair(kit: Kit, dice: Dice) -> Piece:
+def office_chair(kit: Kit, rng: Random) -> Piece:
     """A swivel chair on a star foot."""
     made: list[Surface] = []
     for turn in range(5):
@@ -88,19 +85,19 @@ def office_chair(kit: Kit, dice: Dice) -> Piece:
     return Piece("office chair", made, 0.58, 0.58, 1.1)
 
 
-def pouf(kit: Kit, dice: Dice) -> Piece:
+def pouf(kit: Kit, rng: Random) -> Piece:
     """An upholstered stool."""
-    side = dice.number(0.42, 0.5)
-    made = cushion((side, SEAT_M, side), (0, SEAT_M / 2, 0), 0.09, dice.pick(kit.cushions), puff=0.0)
+    side = rng.uniform(0.42, 0.5)
+    made = cushion((side, SEAT_M, side), (0, SEAT_M / 2, 0), 0.09, rng.choice(kit.cushions), puff=0.0)
     return Piece("pouf", made, side, side, SEAT_M)
 
 
-def bed(kit: Kit, dice: Dice) -> Piece:
+def bed(kit: Kit, rng: Random) -> Piece:
     """A bed with headboard, quilt and pillows; the headboard is at the back."""
-    width, depth, high = dice.pick((1.0, 1.5, 1.7)), 2.1, dice.number(0.95, 1.2)
+    width, depth, high = rng.choice((1.0, 1.5, 1.7)), 2.1, rng.uniform(0.95, 1.2)
     made = box((width, 0.22, depth), (0, 0.19, 0), kit.wood, pitch=0.5)
     made += _legs(width - 0.04, depth - 0.04, 0.08, 0.08, kit.dark_wood)
-    board = kit.upholstery if dice.chance(0.4) else kit.wood
+    board = kit.upholstery if rng.chance(0.4) else kit.wood
     made += cushion((width, high - 0.3, 0.07), (0, 0.3 + (high - 0.3) / 2, -depth / 2 + 0.035), 0.03, board)
     made += cushion((width - 0.1, 0.22, depth - 0.14), (0, 0.41, 0.0), 0.06, kit.linen)
     made += cushion((width, 0.2, depth - 0.75), (0, 0.455, 0.345), 0.07, kit.bedding, puff=0.02)
@@ -108,82 +105,40 @@ def bed(kit: Kit, dice: Dice) -> Piece:
     for index in range(count):
         x = 0.0 if count == 1 else (index - 0.5) * width * 0.48
         made += cushion((0.62, 0.13, 0.4), (x, 0.57, -depth / 2 + 0.34), 0.06, kit.linen, puff=0.03)
-    made += _pillow(kit, dice, 0.0, 0.62, -depth / 2 + 0.62, -0.95)
+    made += _pillow(kit, rng, 0.0, 0.62, -depth / 2 + 0.62, -0.95)
     return Piece("bed", made, width, depth, high)
 
 
-def vase(kit: Kit, dice: Dice, high: float) -> list[Surface]:
-    """A bellied vase, its foot at the origin, metres."""
-    belly = high * dice.number(0.26, 0.36)
-    profile = [
-        (belly * 0.45, high), (belly * 0.5, high * 0.92), (belly * 0.36, high * 0.8), (belly * 0.8, high * 0.6),
-        (belly, high * 0.36), (belly * 0.8, high * 0.12), (belly * 0.55, 0.0),
-    ]  # fmt: skip
-    return lathe([(0.002, high * 0.94), *profile], (0, 0, 0), dice.pick(kit.ceramics), segments=12)
-
-
-def bowl(kit: Kit, dice: Dice) -> list[Surface]:
-    """A bowl with fruit, its foot at the origin."""
-    profile = [(0.001, 0.03), (0.09, 0.05), (0.14, 0.09), (0.145, 0.09), (0.1, 0.03), (0.06, 0.0)]
-    made = lathe(profile, (0, 0, 0), dice.pick(kit.ceramics), segments=14)
-    for x, z in ((-0.04, 0.02), (0.045, 0.03), (0.0, -0.05)):
-        made += lathe(
-            [(0.001, 0.075), (0.03, 0.065), (0.04, 0.04), (0.03, 0.012), (0.001, 0.004)], (x, 0.045, z),
-            dice.pick(kit.cushions), segments=8,
-        )  # fmt: skip
-    return made
-
-
-def book_stack(kit: Kit, dice: Dice) -> list[Surface]:
-    """A few books lying on each other, foot at the origin."""
-    made, y = [], 0.0
-    for _ in range(dice.whole(2, 4)):
-        thick = dice.number(0.02, 0.04)
-        one = box((0.23, thick, 0.16), (0, 0, 0), kit.books, fit=spine_cell(dice.whole(0, SPINES - 1)), pitch=1)
-        made += shifted(yawed(one, dice.number(-0.3, 0.3)), 0, y + thick / 2, 0)
-        y += thick + 0.001
-    return made
-
-
-def table_lamp(kit: Kit, dice: Dice) -> list[Surface]:
-    """A small lamp, its foot at the origin, 0.46 m high."""
-    made = lathe(
-        [(0.012, 0.3), (0.02, 0.24), (0.06, 0.16), (0.075, 0.09), (0.05, 0.02), (0.06, 0.0)], (0, 0, 0),
-        dice.pick(kit.ceramics), segments=10,
-    )  # fmt: skip
-    return made + lathe([(0.09, 0.46), (0.15, 0.26)], (0, 0, 0), kit.lampshade, segments=14, open_ended=True)
-
-
-def coffee_table(kit: Kit, dice: Dice) -> Piece:
+def coffee_table(kit: Kit, rng: Random) -> Piece:
     """A low table, round or rectangular, with books and a bowl."""
     high = 0.45
-    if dice.chance(0.35):
-        radius = dice.number(0.38, 0.46)
-        top = kit.stone if dice.chance(0.5) else kit.wood
+    if rng.chance(0.35):
+        radius = rng.uniform(0.38, 0.46)
+        top = kit.stone if rng.chance(0.5) else kit.wood
         made = cylinder(radius, high - 0.04, high, (0, 0, 0), top, 24)
         made += cylinder(0.05, 0.03, high - 0.04, (0, 0, 0), kit.metal, 10)
         made += cylinder(radius * 0.6, 0.0, 0.03, (0, 0, 0), kit.metal, 18)
         width = depth = 2 * radius
     else:
-        width, depth = dice.number(0.9, 1.15), dice.number(0.5, 0.6)
+        width, depth = rng.uniform(0.9, 1.15), rng.uniform(0.5, 0.6)
         made = box((width, 0.04, depth), (0, high - 0.02, 0), kit.wood)
         made += shifted(_legs(width - 0.06, depth - 0.06, high - 0.04, 0.05, kit.dark_wood), 0, 0, 0)
         made += box((width - 0.1, 0.02, depth - 0.1), (0, 0.16, 0), kit.wood, pitch=0.5)
-        made += shifted(book_stack(kit, dice), -width * 0.2, 0.171, 0)
-    made += shifted(book_stack(kit, dice), -width * 0.22, high + 0.001, 0.02)
-    made += shifted(bowl(kit, dice) if dice.chance(0.6) else vase(kit, dice, 0.26), width * 0.2, high + 0.001, -0.03)
+        made += shifted(book_stack(kit, rng), -width * 0.2, 0.171, 0)
+    made += shifted(book_stack(kit, rng), -width * 0.22, high + 0.001, 0.02)
+    made += shifted(bowl(kit, rng) if rng.chance(0.6) else vase(kit, rng, 0.26), width * 0.2, high + 0.001, -0.03)
     return Piece("coffee table", made, width, depth, high + 0.27)
 
 
-def dining_table(kit: Kit, dice: Dice, width: float, depth: float) -> Piece:
+def dining_table(kit: Kit, rng: Random, width: float, depth: float) -> Piece:
     """A table to eat at, with a runner, plates and a vase."""
     high = 0.75
     made = box((width, 0.04, depth), (0, high - 0.02, 0), kit.wood, pitch=0.3)
     made += box((width - 0.14, 0.08, depth - 0.14), (0, high - 0.08, 0), kit.wood, pitch=0.5)
     made += _legs(width - 0.08, depth - 0.08, high - 0.04, 0.07, kit.dark_wood)
-    made += box((width * 0.7, 0.006, 0.32), (0, high + 0.003, 0), dice.pick(kit.cushions), pitch=0.3)
-    made += shifted(vase(kit, dice, dice.number(0.24, 0.36)), 0.05, high + 0.007, 0.0)
-    made += shifted(bowl(kit, dice), -width * 0.22, high + 0.007, 0.0)
+    made += box((width * 0.7, 0.006, 0.32), (0, high + 0.003, 0), rng.choice(kit.cushions), pitch=0.3)
+    made += shifted(vase(kit, rng, rng.uniform(0.24, 0.36)), 0.05, high + 0.007, 0.0)
+    made += shifted(bowl(kit, rng), -width * 0.22, high + 0.007, 0.0)
     plate = [(0.001, 0.012), (0.08, 0.012), (0.125, 0.024), (0.12, 0.016), (0.07, 0.0)]
     for x in (-width * 0.25, width * 0.25):
         for z in (-depth * 0.33, depth * 0.33):
@@ -191,60 +146,54 @@ def dining_table(kit: Kit, dice: Dice, width: float, depth: float) -> Piece:
     return Piece("dining table", made, width, depth, high + 0.37)
 
 
-def round_table(kit: Kit, dice: Dice, radius: float) -> Piece:
+def round_table(kit: Kit, rng: Random, radius: float) -> Piece:
     """A round dining table on one foot."""
     high = 0.75
-    made = cylinder(radius, high - 0.035, high, (0, 0, 0), kit.stone if dice.chance(0.4) else kit.wood, 28)
+    made = cylinder(radius, high - 0.035, high, (0, 0, 0), kit.stone if rng.chance(0.4) else kit.wood, 28)
     foot = [(0.06, high - 0.035), (0.05, 0.5), (0.07, 0.25), (0.05, 0.1), (0.24, 0.03), (0.25, 0.0)]
     made += lathe(foot, (0, 0, 0), kit.dark_wood, segments=14)
-    made += shifted(vase(kit, dice, 0.3), 0, high + 0.001, 0)
-    made += shifted(book_stack(kit, dice), radius * 0.5, high + 0.001, radius * 0.3)
+    made += shifted(vase(kit, rng, 0.3), 0, high + 0.001, 0)
+    made += shifted(book_stack(kit, rng), radius * 0.5, high + 0.001, radius * 0.3)
     return Piece("dining table", made, 2 * radius, 2 * radius, high + 0.3)
 
 
-def desk(kit: Kit, dice: Dice) -> Piece:
+def desk(kit: Kit, rng: Random) -> Piece:
     """A desk with drawers, a screen, a keyboard, a lamp and books; the user sits at the front."""
-    width, depth, high = dice.number(1.2, 1.5), 0.65, 0.74
+    width, depth, high = rng.uniform(1.2, 1.5), 0.65, 0.74
     made = box((width, 0.035, depth), (0, high - 0.0175, 0), kit.wood)
     made += box((0.4, 0.5, depth - 0.06), (width / 2 - 0.22, high - 0.29, 0), kit.trim)
     for place in (0.27, 0.43, 0.59):
         made += box((0.36, 0.145, 0.012), (width / 2 - 0.22, place + 0.04, depth / 2 - 0.024), kit.wood, pitch=1)
         made += box((0.12, 0.012, 0.02), (width / 2 - 0.22, place + 0.07, depth / 2 - 0.012), kit.metal, pitch=1)
-    for x, z in (
-        (-width / 2 + 0.05, -0.28),
-        (-width / 2 + 0.05, 0.28),
-        (width / 2 - 0.05, -0.28),
-        (width / 2 - 0.05, 0.28),
-    ):
-        made += box((0.05, high - 0.035, 0.05), (x, (high - 0.035) / 2, z), kit.dark_wood, pitch=1)
+    for x in (-width / 2 + 0.05, width / 2 - 0.05):
+        for z in (-0.28, 0.28):
+            made += box((0.05, high - 0.035, 0.05), (x, (high - 0.035) / 2, z), kit.dark_wood, pitch=1)
     made += box((0.24, 0.012, 0.18), (-0.08, high + 0.007, -0.14), kit.black, pitch=1)
     made += box((0.05, 0.2, 0.03), (-0.08, high + 0.1, -0.17), kit.black, pitch=1)
     made += box((0.62, 0.37, 0.03), (-0.08, high + 0.31, -0.15), kit.black, pitch=1)
-    made += box(
-        (0.59, 0.34, 0.004), (-0.08, high + 0.31, -0.131), kit.screen, faces=("front",), fit=(0, 0, 1, 1), pitch=1
-    )
+    shown = (0.59, 0.34, 0.004)
+    made += box(shown, (-0.08, high + 0.31, -0.131), kit.screen, faces=("front",), fit=(0, 0, 1, 1), pitch=1)
     made += box((0.42, 0.02, 0.14), (-0.08, high + 0.011, 0.14), kit.keys, fit=(0, 0, 1, 1), pitch=1)
-    made += shifted(table_lamp(kit, dice), width / 2 - 0.2, high + 0.001, -0.12)
-    made += shifted(book_stack(kit, dice), -width / 2 + 0.17, high + 0.001, 0.05)
+    made += shifted(table_lamp(kit, rng), width / 2 - 0.2, high + 0.001, -0.12)
+    made += shifted(book_stack(kit, rng), -width / 2 + 0.17, high + 0.001, 0.05)
     return Piece("desk", made, width, depth, 1.25, (Lamp((width / 2 - 0.2, 1.05, 0.0), 0.12),))
 
 
-def side_table(kit: Kit, dice: Dice) -> Piece:
+def side_table(kit: Kit, rng: Random) -> Piece:
     """A small table or night stand with a lamp or a vase."""
-    side, high = 0.44, dice.number(0.5, 0.58)
-    if dice.chance(0.5):
+    side, high = 0.44, rng.uniform(0.5, 0.58)
+    if rng.chance(0.5):
         made = cylinder(side / 2, high - 0.03, high, (0, 0, 0), kit.wood, 20)
         made += shifted(_legs(0.3, 0.3, high - 0.03, 0.03, kit.dark_wood), 0, 0, 0)
     else:
-        made = box((side, high - 0.12, side), (0, 0.12 + (high - 0.12) / 2, 0), kit.wood)
+        middle = 0.12 + (high - 0.12) / 2
+        made = box((side, high - 0.12, side), (0, middle, 0), kit.wood)
         made += _legs(side - 0.04, side - 0.04, 0.12, 0.04, kit.dark_wood)
-        made += box(
-            (side - 0.06, high - 0.2, 0.012), (0, 0.12 + (high - 0.12) / 2, side / 2 + 0.006), kit.dark_wood, pitch=1
-        )
+        made += box((side - 0.06, high - 0.2, 0.012), (0, middle, side / 2 + 0.006), kit.dark_wood, pitch=1)
         made += box((0.03, 0.03, 0.02), (0, high - 0.14, side / 2 + 0.02), kit.metal, pitch=1)
-    if dice.chance(0.65):
-        made += shifted(table_lamp(kit, dice), -0.04, high + 0.001, -0.05)
+    if rng.chance(0.65):
+        made += shifted(table_lamp(kit, rng), -0.04, high + 0.001, -0.05)
         return Piece("side table", made, side, side + 0.06, high + 0.47, (Lamp((0.0, high + 0.4, 0.1), 0.16),))
-    made += shifted(vase(kit, dice, 0.3), -0.06, high + 0.001, -0.05)
-    made += shifted(book_stack(kit, dice), 0.06, high + 0.001, 0.1)
+    made += shifted(vase(kit, rng, 0.3), -0.06, high + 0.001, -0.05)
+    made += shifted(book_stack(kit, rng), 0.06, high + 0.001, 0.1)
     return Piece("side table", made, side, side + 0.06, high + 0.31)

@@ -8,35 +8,34 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from avp_habitat.scenes.builtin.noise import Picture
+
 Float = NDArray[np.floating]
 Vector = tuple[float, float, float]
 Rectangle = tuple[float, float, float, float]
+HALF_TURN = 3.14159265
+"""Radians, with as many digits as the first rooms were made with."""
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """A picture and how it lies on a surface."""
+    """A picture, the metres that it spans along u and v, and whether it glows, so that baked light leaves it alone."""
 
-    paint: Callable[[], NDArray[np.uint8]]
-    """Makes the picture, `(height, width, 3)` sRGB; called once, when the picture is first needed."""
+    paint: Callable[[], Picture]
+    """Makes the picture; called once, when it is first needed."""
     width_m: float
-    """Metres that the picture spans along u."""
     height_m: float
-    """Metres that the picture spans along v."""
-    tint: Vector = (1.0, 1.0, 1.0)
-    """Multiplies the picture."""
     glows: bool = False
-    """Whether the surface shines by itself, so that baked light leaves it alone."""
 
     @cached_property
-    def picture(self) -> NDArray[np.uint8]:
+    def picture(self) -> Picture:
         """`(height, width, 3)` sRGB."""
         return self.paint()
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles of one material."""
+    """Triangles of one material, counter-clockwise as seen from outside."""
 
     vertices: Float
     """`(v, 3)` metres."""
@@ -45,7 +44,7 @@ class Surface:
     uv: Float
     """`(v, 2)` texture coordinates, v down."""
     triangles: NDArray[np.int32]
-    """`(t, 3)` counter-clockwise as seen from outside."""
+    """`(t, 3)`."""
     material: Material
 
 
@@ -62,13 +61,9 @@ def _unit(vectors: Float) -> Float:
 
 
 def sheet(points: Float, uv: Float, material: Material, *, both_sides: bool = False) -> list[Surface]:
-    """A curved sheet through a grid of points.
+    """A curved sheet through `(rows, columns, 3)` points in metres; `both_sides` adds a back, 3 mm behind the front.
 
-    Args:
-        points: `(rows, columns, 3)` metres; rows run down and columns right, seen from the front.
-        uv: `(rows, columns, 2)` texture coordinates.
-        material: of the sheet.
-        both_sides: add a back, 3 mm behind the front.
+    Rows run down and columns right, seen from the front; texture coordinates are `(rows, columns, 2)`.
     """
     rows, columns = points.shape[:2]
     vertices, triangles = points.reshape(-1, 3), _grid_triangles(rows, columns)
@@ -107,25 +102,33 @@ def panel(
     origin: tuple[float, float] = (0.0, 0.0),
     holes: tuple[Rectangle, ...] = (),
 ) -> Surface:
-    """A flat rectangle, subdivided so that light can vary over it.
+    """A flat rectangle, subdivided so that light can vary over it; all lengths are in metres.
 
     Args:
-        corner: upper left corner as seen from the front, metres.
-        right: edge from the left to the right, metres.
-        down: edge from the upper to the lower side, metres.
+        corner: upper left corner as seen from the front.
+        right: edge from the left to the right.
+        down: edge from the upper to the lower side.
         material: of the rectangle.
-        pitch: largest distance between vertices in metres.
+        pitch: largest distance between vertices.
         fit: texture rectangle (u0, v0, u1, v1) to stretch over it instead of measuring in metres.
         turned: let u of the picture run downwards.
-        origin: metres along right and down at which the picture starts.
-        holes: rectangles (right0, down0, right1, down1) in metres that are left out.
+        origin: how far along right and down the picture starts.
+        holes: rectangles (right0, down0, right1, down1) that are left out.
     """
     start, across, fall = (np.asarray(part, dtype=np.float64) for part in (corner, right, down))
     width, height = float(np.sqrt((across**2).sum())), float(np.sqrt((fall**2).sum()))
     s = breaks(width, pitch, tuple(x for hole in holes for x in (hole[0], hole[2])))
     t = breaks(height, pitch, tuple(y for hole in holes for y in (hole[1], hole[3])))
     points = start + (s / width)[None, :, None] * across + (t / height)[:, None, None] * fall
-    uv = _panel_uv(s, t, width, height, material, fit, turned, origin)
+    if fit is not None:
+        u, v = fit[0] + (fit[2] - fit[0]) * s / width, fit[1] + (fit[3] - fit[1]) * t / height
+        grid_v, grid_u = np.meshgrid(v, u, indexing="ij")
+    else:
+        grid_v, grid_u = np.meshgrid(t + origin[1], s + origin[0], indexing="ij")
+        if turned:
+            grid_u, grid_v = grid_v, grid_u
+        grid_u, grid_v = grid_u / material.width_m, grid_v / material.height_m
+    uv = np.stack([grid_u, grid_v], axis=-1).reshape(-1, 2)
     triangles = _grid_triangles(len(t), len(s))
     if holes:
         mid_s, mid_t = (s[:-1] + s[1:]) / 2, (t[:-1] + t[1:]) / 2
@@ -137,27 +140,6 @@ def panel(
     used, triangles = np.unique(triangles, return_inverse=True)
     vertices, uv, triangles = points.reshape(-1, 3)[used], uv[used], triangles.reshape(-1, 3).astype(np.int32)
     return Surface(vertices, np.broadcast_to(normal, vertices.shape).copy(), uv, triangles, material)
-
-
-def _panel_uv(
-    s: Float,
-    t: Float,
-    width: float,
-    height: float,
-    material: Material,
-    fit: Rectangle | None,
-    turned: bool,
-    origin: tuple[float, float],
-) -> Float:
-    if fit is not None:
-        u, v = fit[0] + (fit[2] - fit[0]) * s / width, fit[1] + (fit[3] - fit[1]) * t / height
-        grid_v, grid_u = np.meshgrid(v, u, indexing="ij")
-    else:
-        grid_v, grid_u = np.meshgrid(t + origin[1], s + origin[0], indexing="ij")
-        if turned:
-            grid_u, grid_v = grid_v, grid_u
-        grid_u, grid_v = grid_u / material.width_m, grid_v / material.height_m
-    return np.stack([grid_u, grid_v], axis=-1).reshape(-1, 2)
 
 
 _FACES = {
@@ -222,15 +204,9 @@ def box(
     fit: Rectangle | None = None,
     pitch: float = 0.35,
 ) -> list[Surface]:
-    """A cuboid; the picture's u runs along its longest edge, as wood is cut.
+    """A cuboid of extents and middle in metres; the picture's u runs along its longest edge, as wood is cut.
 
-    Args:
-        size: extents along x, y, z in metres.
-        centre: its middle in metres.
-        material: of all faces.
-        faces: which faces to make, of front (+z), back, right (+x), left, top, bottom.
-        fit: texture rectangle to stretch over every face instead of measuring in metres.
-        pitch: largest distance between vertices in metres.
+    Faces are front (+z), back, right (+x), left, top, bottom; `fit` and `pitch` as of `panel`.
     """
     extent, middle = np.asarray(size, dtype=np.float64), np.asarray(centre, dtype=np.float64)
     if max(size) <= pitch:
@@ -282,14 +258,10 @@ def lathe(
     segments: int = 12,
     open_ended: bool = False,
 ) -> list[Surface]:
-    """A surface of revolution about a vertical axis.
+    """A surface of revolution about the vertical axis whose foot is `centre`.
 
-    Args:
-        profile: (radius, height) in metres from the top of the outside downwards.
-        centre: foot of the axis in metres.
-        material: of the surface.
-        segments: faces around.
-        open_ended: whether the inside can be seen and so needs a surface.
+    The profile is (radius, height) in metres from the top of the outside downwards, `segments` the number of faces
+    around; where the inside can be seen, it is `open_ended` and has a surface there, too.
     """
     outline = np.asarray(profile, dtype=np.float64)
     angle = np.arange(segments + 1) * (2 * np.pi / segments)
@@ -307,10 +279,8 @@ def cylinder(
     radius: float, bottom: float, top: float, centre: Vector, material: Material, segments: int = 12
 ) -> list[Surface]:
     """An upright cylinder with sharp rims between two heights above its foot, metres."""
-    lid = lathe([(0.0005, top), (radius, top)], centre, material, segments=segments)
-    side = lathe([(radius, top), (radius, bottom)], centre, material, segments=segments)
-    base = lathe([(radius, bottom), (0.0005, bottom)], centre, material, segments=segments)
-    return lid + side + base
+    rims = [(0.0005, top), (radius, top), (radius, bottom), (0.0005, bottom)]
+    return [part for ends in pairwise(rims) for part in lathe([*ends], centre, material, segments=segments)]
 
 
 def moved(surfaces: list[Surface], axes: Float, offset: Float) -> list[Surface]:
@@ -338,13 +308,9 @@ def joined(surfaces: list[Surface]) -> list[Surface]:
     made = []
     for parts in by_material.values():
         starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-        made.append(
-            Surface(
-                np.concatenate([part.vertices for part in parts]),
-                np.concatenate([part.normals for part in parts]),
-                np.concatenate([part.uv for part in parts]),
-                np.concatenate([p.triangles + np.int32(start) for p, start in zip(parts, starts, strict=True)]),
-                parts[0].material,
-            )
+        triangles = [part.triangles + np.int32(start) for part, start in zip(parts, starts, strict=True)]
+        vertices, normals, uv = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("vertices", "normals", "uv")
         )
+        made.append(Surface(vertices, normals, uv, np.concatenate(triangles), parts[0].material))
     return made

@@ -1,16 +1,21 @@
 """Surfaces of the empty room: floor, ceiling, walls, windows, door, curtains."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.scenes.builtin.kit import Kit
-from avp_habitat.scenes.builtin.random import Dice
-from avp_habitat.scenes.builtin.shapes import Material, Surface, box, moved, panel, sheet
+from avp_habitat.scenes.builtin.noise import Random
+from avp_habitat.scenes.builtin.shapes import Material, Rectangle, Surface, box, moved, panel, sheet
 
 Point = tuple[float, float]
+"""x, z on the floor in metres, or a direction there."""
+CURTAIN_M = 0.3
+"""Width of a drawn curtain beside its window."""
+_RECESS_M = 0.14
+_SLACK_M = 1e-6
 
 
 @dataclass(frozen=True)
@@ -18,15 +23,14 @@ class Wall:
     """A straight wall; seen from inside it runs from `start` to the right."""
 
     start: Point
-    """x, z in metres."""
     along: Point
-    """Unit vector to the right on the floor."""
+    """Unit vector to the right."""
     length: float
     """Metres."""
 
     @property
     def inward(self) -> Point:
-        """Unit vector into the room on the floor."""
+        """Unit vector into the room."""
         return (-self.along[1], self.along[0])
 
     def axes(self) -> NDArray[np.float64]:
@@ -35,39 +39,35 @@ class Wall:
         return np.array([[ax, 0.0, nx], [0.0, 1.0, 0.0], [az, 0.0, nz]])
 
     def point(self, right: float, inwards: float) -> Point:
-        """x, z of a point that far along the wall and in front of it, metres."""
+        """A point that far along the wall and in front of it, metres."""
         (ax, az), (nx, nz) = self.along, self.inward
         return self.start[0] + ax * right + nx * inwards, self.start[1] + az * right + nz * inwards
 
 
 @dataclass(frozen=True)
 class Opening:
-    """A window or door in a wall."""
+    """A window or door in a wall: metres from its left end, and above the floor."""
 
     wall: int
     """Index of the wall."""
     left: float
-    """Metres along the wall."""
     right: float
-    """Metres along the wall."""
     bottom: float
-    """Metres above the floor."""
     top: float
-    """Metres above the floor."""
     kind: str
     """`"window"` or `"door"`."""
 
 
 @dataclass(frozen=True)
 class Shell:
-    """The empty room."""
+    """The empty room; lengths are in metres."""
 
     corners: tuple[Point, ...]
-    """Outline on the floor in the order of the walls, metres."""
-    notch: tuple[float, float, float, float] | None
+    """Outline on the floor in the order of the walls."""
+    notch: Rectangle | None
     """x0, z0, x1, z1 of the rectangle that an L-shaped room lacks."""
     ceiling: float
-    """Metres above the floor."""
+    """Height of the ceiling."""
     openings: tuple[Opening, ...]
     """Windows and the door."""
 
@@ -81,7 +81,7 @@ class Shell:
         return tuple(made)
 
     @cached_property
-    def bounds(self) -> tuple[float, float, float, float]:
+    def bounds(self) -> Rectangle:
         """x0, z0, x1, z1 of the outline."""
         xs, zs = [x for x, _ in self.corners], [z for _, z in self.corners]
         return min(xs), min(zs), max(xs), max(zs)
@@ -96,13 +96,12 @@ class Shell:
     def contains(self, x0: float, z0: float, x1: float, z1: float) -> bool:
         """Whether a rectangle on the floor lies inside the outline."""
         left, near, right, far = self.bounds
-        slack = 1e-6
-        if x0 < left - slack or z0 < near - slack or x1 > right + slack or z1 > far + slack:
+        if x0 < left - _SLACK_M or z0 < near - _SLACK_M or x1 > right + _SLACK_M or z1 > far + _SLACK_M:
             return False
         if self.notch is None:
             return True
         a, b, c, d = self.notch
-        return x1 <= a + slack or x0 >= c - slack or z1 <= b + slack or z0 >= d - slack
+        return x1 <= a + _SLACK_M or x0 >= c - _SLACK_M or z1 <= b + _SLACK_M or z0 >= d - _SLACK_M
 
     def depth_at(self, wall: Wall, right: float) -> float:
         """Metres from a point of a wall straight to what stands opposite."""
@@ -112,58 +111,48 @@ class Shell:
         depth = (self.bounds[ahead + 2 if sign > 0 else ahead] - point[ahead]) * sign
         if self.notch is not None and self.notch[aside] < point[aside] < self.notch[aside + 2]:
             gap = (self.notch[ahead if sign > 0 else ahead + 2] - point[ahead]) * sign
-            depth = min(depth, gap) if gap > 1e-6 else depth
+            depth = min(depth, gap) if gap > _SLACK_M else depth
         return round(depth, 2)
 
 
-def _outline(dice: Dice) -> tuple[tuple[Point, ...], tuple[float, float, float, float] | None]:
-    width, depth = dice.number(4.0, 8.0), dice.number(3.5, 6.5)
+def _outline(rng: Random) -> tuple[tuple[Point, ...], Rectangle | None]:
+    """Corners and, of an L-shaped room, what it lacks."""
+    width, depth = rng.uniform(4.0, 8.0), rng.uniform(3.5, 6.5)
     x0, z0 = -round(width / 2, 2), -round(depth / 2, 2)
     x1, z1 = round(x0 + width, 2), round(z0 + depth, 2)
-    if width < 5.2 or depth < 4.6 or dice.chance(0.4):
-        return ((x0, z0), (x1, z0), (x1, z1), (x0, z1)), None
-    wide = min(round(width * dice.number(0.32, 0.5), 2), width - 2.6)
-    deep = min(round(depth * dice.number(0.32, 0.5), 2), depth - 2.4)
-    corner = dice.whole(0, 3)
-    if corner == 0:
-        xa, za = round(x0 + wide, 2), round(z0 + deep, 2)
-        return ((xa, z0), (x1, z0), (x1, z1), (x0, z1), (x0, za), (xa, za)), (x0, z0, xa, za)
-    if corner == 1:
-        xa, za = round(x1 - wide, 2), round(z0 + deep, 2)
-        return ((x0, z0), (xa, z0), (xa, za), (x1, za), (x1, z1), (x0, z1)), (xa, z0, x1, za)
-    if corner == 2:
-        xa, za = round(x1 - wide, 2), round(z1 - deep, 2)
-        return ((x0, z0), (x1, z0), (x1, za), (xa, za), (xa, z1), (x0, z1)), (xa, za, x1, z1)
-    xa, za = round(x0 + wide, 2), round(z1 - deep, 2)
-    return ((x0, z0), (x1, z0), (x1, z1), (xa, z1), (xa, za), (x0, za)), (x0, za, xa, z1)
+    corners = [(x0, z0), (x1, z0), (x1, z1), (x0, z1)]
+    if width < 5.2 or depth < 4.6 or rng.chance(0.4):
+        return tuple(corners), None
+    wide = min(round(width * rng.uniform(0.32, 0.5), 2), width - 2.6)
+    deep = min(round(depth * rng.uniform(0.32, 0.5), 2), depth - 2.4)
+    missing = rng.integer(0, 3)
+    a, b = corners[missing]
+    c, d = round(x0 + wide if a == x0 else x1 - wide, 2), round(z0 + deep if b == z0 else z1 - deep, 2)
+    inner = [(a, d), (c, d), (c, b)]
+    corners[missing : missing + 1] = inner[::-1] if missing % 2 else inner
+    if missing == 0:
+        corners = corners[2:] + corners[:2]
+    return tuple(corners), (min(a, c), min(b, d), max(a, c), max(b, d))
 
 
-def _window(dice: Dice, wall: int, length: float, ceiling: float) -> Opening:
-    width = min(dice.number(1.1, 2.0), length - 1.4)
-    left = round((length - width) * dice.number(0.35, 0.65), 2)
-    bottom = dice.pick((0.85, 0.9, 0.95, 0.55))
+def _window(rng: Random, wall: int, length: float, ceiling: float) -> Opening:
+    width = min(rng.uniform(1.1, 2.0), length - 1.4)
+    left = round((length - width) * rng.uniform(0.35, 0.65), 2)
+    bottom = rng.choice((0.85, 0.9, 0.95, 0.55))
     return Opening(wall, left, round(left + width, 2), bottom, round(min(ceiling - 0.35, 2.25), 2), "window")
 
 
-def plan_shell(dice: Dice) -> Shell:
+def plan_shell(rng: Random) -> Shell:
     """A rectangular or L-shaped room with one door and one to three windows on other walls."""
-    corners, notch = _outline(dice)
-    ceiling = dice.number(2.5, 3.2)
+    corners, notch = _outline(rng)
+    ceiling = rng.uniform(2.5, 3.2)
     shell = Shell(corners, notch, ceiling, ())
-    walls = shell.walls
-    order = dice.shuffled([index for index, wall in enumerate(walls) if wall.length >= 2.4])
-    door_wall = walls[order[0]]
-    left = 0.3 if dice.chance(0.5) else round(door_wall.length - 1.2, 2)
-    openings = [Opening(order[0], left, round(left + 0.9, 2), 0.0, 2.05, "door")]
-    windows = dice.whole(1, 2) if shell.floor_area < 24 else dice.whole(2, 3)
-    for index in order[1 : 1 + windows]:
-        openings.append(_window(dice, index, walls[index].length, ceiling))
-    return Shell(corners, notch, ceiling, tuple(openings))
-
-
-RECESS_M = 0.14
-CURTAIN_M = 0.3
-"""Width of a drawn curtain beside its window."""
+    first, *others = rng.shuffled([index for index, wall in enumerate(shell.walls) if wall.length >= 2.4])
+    left = 0.3 if rng.chance(0.5) else round(shell.walls[first].length - 1.2, 2)
+    openings = [Opening(first, left, round(left + 0.9, 2), 0.0, 2.05, "door")]
+    windows = rng.integer(1, 2) if shell.floor_area < 24 else rng.integer(2, 3)
+    openings += [_window(rng, index, shell.walls[index].length, ceiling) for index in others[:windows]]
+    return replace(shell, openings=tuple(openings))
 
 
 def _floor_and_ceiling(kit: Kit, shell: Shell) -> list[Surface]:
@@ -194,16 +183,16 @@ def _reveal(left: float, right: float, bottom: float, top: float, deep: float, m
 def _window_surfaces(kit: Kit, hole: Opening) -> list[Surface]:
     left, right, bottom, top = hole.left, hole.right, hole.bottom, hole.top
     width, height = right - left, top - bottom
-    made = _reveal(left, right, bottom, top, RECESS_M, kit.trim)
-    back = (left, top, -RECESS_M)
+    made = _reveal(left, right, bottom, top, _RECESS_M, kit.trim)
+    back = (left, top, -_RECESS_M)
     made.append(panel(back, (width, 0.0, 0.0), (0.0, -height, 0.0), kit.view(), fit=(0, 0, 1, 1), pitch=1.0))
-    bar, z = 0.05, -RECESS_M + 0.03
+    bar, z = 0.05, -_RECESS_M + 0.03
     for x in np.linspace(left + bar / 2, right - bar / 2, 3 if width < 1.5 else 4):
         made += box((bar, height, 0.05), (float(x), (top + bottom) / 2, z), kit.trim, pitch=0.6)
     for y in (bottom + bar / 2 + 0.013, bottom + height * 0.7, top - bar / 2):
         made += box((width, bar, 0.044), ((left + right) / 2, y, z), kit.trim, pitch=0.6)
-    sill = (width + 0.12, 0.032, RECESS_M + 0.05)
-    return made + box(sill, ((left + right) / 2, bottom - 0.004, 0.025 - RECESS_M / 2 + 0.02), kit.trim)
+    sill = (width + 0.12, 0.032, _RECESS_M + 0.05)
+    return made + box(sill, ((left + right) / 2, bottom - 0.004, 0.025 - _RECESS_M / 2 + 0.02), kit.trim)
 
 
 def _door(kit: Kit, hole: Opening) -> list[Surface]:
@@ -250,11 +239,8 @@ def curtain_bottom(shell: Shell, hole: Opening) -> float:
 
 
 def _skirting(kit: Kit, wall: Wall, holes: list[Opening]) -> list[Surface]:
-    edges = [0.0]
-    for hole in holes:
-        if hole.kind == "door":
-            edges += [hole.left - 0.08, hole.right + 0.08]
-    edges.append(wall.length)
+    beside = [edge for hole in holes if hole.kind == "door" for edge in (hole.left - 0.08, hole.right + 0.08)]
+    edges = [0.0, *beside, wall.length]
     made = []
     for left, right in zip(edges[::2], edges[1::2], strict=True):
         if right - left > 0.02:
@@ -277,12 +263,12 @@ def _wall(kit: Kit, shell: Shell, index: int, material: Material) -> list[Surfac
     return moved(made, wall.axes(), np.array([wall.start[0], 0.0, wall.start[1]]))
 
 
-def build_shell(kit: Kit, dice: Dice, shell: Shell) -> list[Surface]:
+def build_shell(kit: Kit, rng: Random, shell: Shell) -> list[Surface]:
     """All surfaces of the empty room in the world frame; their fronts look inwards."""
     made = _floor_and_ceiling(kit, shell)
-    order = dice.shuffled(list(range(len(shell.walls))))
+    order = rng.shuffled(list(range(len(shell.walls))))
     special = dict(zip(order, (kit.feature_wall, kit.papered_wall), strict=False))
-    if dice.chance(0.4):
+    if rng.chance(0.4):
         special[order[2]] = kit.feature_wall
     for index in range(len(shell.walls)):
         made += _wall(kit, shell, index, special.get(index, kit.wall))

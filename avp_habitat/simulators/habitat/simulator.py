@@ -4,7 +4,6 @@ import tempfile
 import weakref
 from dataclasses import astuple
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +15,13 @@ from avp_habitat.navigation.settings import NavigationSettings
 from avp_habitat.poses import Intrinsics, camera_to_world
 from avp_habitat.scenes.loader import identify
 from avp_habitat.scenes.location import Frame, SceneLocation, locate
-from avp_habitat.sight.coverage import visible_in_depth
+from avp_habitat.sight.rules import visible_in_depth
 from avp_habitat.simulators.base import Frames
 from avp_habitat.simulators.habitat import process
 from avp_habitat.simulators.habitat.engine import HabitatEngine, OverheadCamera
 from avp_habitat.simulators.habitat.graphics import choose_gpu
 from avp_habitat.simulators.habitat.installed import require_installed
 from avp_habitat.simulators.habitat.stage import write_stage
-
-if TYPE_CHECKING:
-    from avp_habitat.simulators.habitat.engine import HabitatEngine
-
 
 _TILE = OverheadCamera(pixels=1024, side_m=10.24)
 """One pixel a centimetre."""
@@ -137,8 +132,6 @@ class HabitatSimulator:
         self._closing = weakref.finalize(self, _close, self._engine)
         self.version = self._engine.version
         try:
-            pass
-
             _check_objects(location, self._engine.objects)
             self._area = navmesh_area(self._engine, None if navmesh is None else Path(navmesh))
         except BaseException as error:
@@ -220,12 +213,10 @@ def _finer(camera: Intrinsics) -> Intrinsics:
     return Intrinsics(*(times * value for value in astuple(camera)))
 
 
-def _open(location: SceneLocation, frame: Frame, gpu: int) -> "HabitatEngine":
+def _open(location: SceneLocation, frame: Frame, gpu: int) -> HabitatEngine:
     process.claim(location.name)
     try:
         process.import_before_graphics()
-        from avp_habitat.simulators.habitat.engine import HabitatEngine
-
         with tempfile.TemporaryDirectory(prefix="avp-habitat-") as folder:
             return HabitatEngine(*write_stage(location, frame, Path(folder)), gpu=gpu)
     except BaseException:
@@ -233,7 +224,7 @@ def _open(location: SceneLocation, frame: Frame, gpu: int) -> "HabitatEngine":
         raise
 
 
-def _close(engine: "HabitatEngine") -> None:
+def _close(engine: HabitatEngine) -> None:
     # A forked child inherits the object, but must leave alone what its parent still uses.
     if process.release():
         engine.close()

@@ -9,8 +9,16 @@ from numpy.typing import NDArray
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout.format import Rollout
 from avp_nerfstudio.check.colmap import triangulate
-from avp_nerfstudio.check.pictures.causes import FOCAL_TOLERANCE, best_focal_factor, likely_cause
-from avp_nerfstudio.check.pictures.frames import FIT_PX, FreedFit, frame_shares, frames_off, pair_shares
+from avp_nerfstudio.check.pictures.causes import (
+    FIT_PX,
+    FOCAL_TOLERANCE,
+    FreedFit,
+    best_focal_factor,
+    frame_shares,
+    frames_off,
+    likely_cause,
+    pair_shares,
+)
 from avp_nerfstudio.check.pictures.matching import Matches, match_pictures
 from avp_nerfstudio.check.pictures.rays import (
     RelativePoses,

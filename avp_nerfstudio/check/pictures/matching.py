@@ -12,9 +12,10 @@ import pycolmap
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from avp_habitat import command
 from avp_habitat.errors import RolloutError
 from avp_habitat.rollout.format import Rollout
-from avp_habitat.rollout.png import check_png_contents
+from avp_habitat.rollout.images import check_png_contents
 
 # Longer rollouts are judged by runs of neighbouring frames, spread evenly over the walk.
 MAX_FRAMES = 240
@@ -116,7 +117,7 @@ def _candidates(count: int) -> list[tuple[int, int]]:
 
 
 def _bar(total: int, text: str, unit: str, *, progress: bool) -> tqdm:
-    return tqdm(total=total, desc=text, unit=unit, disable=None if progress else True)
+    return command.progress(total=total, desc=text, unit=unit, disable=not progress)
 
 
 def _extract(database: Path, folder: Path, names: list[str], *, progress: bool) -> list[NDArray[np.float64]]:

@@ -1,10 +1,11 @@
-"""Relative camera poses estimated from the pictures alone."""
+"""Matches as viewing rays: how far they are from where poses allow them, and relative poses from them alone."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from avp_habitat.poses import Intrinsics, habitat_to_opencv
 from avp_nerfstudio.check.colmap import colmap_camera
@@ -14,6 +15,12 @@ Float = NDArray[np.floating]
 
 # Nothing that a frame shows well is nearer than this: it bounds where a feature of one picture can lie in another.
 NEAREST_M = 0.2
+# Below this shift of the features, the rotation compensated, a pair is a turn on the spot: no direction can be told.
+MIN_PARALLAX_PX = 3.0
+# Too few matches, or matches in a corner, leave the estimate itself uncertain by more than the limits.
+MIN_RELATIVE_MATCHES = 60
+MAX_ERROR_PX = 1.5
+PAIRS_OF_A_FRAME = 6
 
 
 @dataclass(frozen=True)
@@ -110,14 +117,6 @@ def _angle_to_arc(point: Float, start: Float, end: Float) -> Float:
     return np.where(inside & (length > 1e-9), np.arcsin(np.clip(np.abs(height), 0, 1)), to_ends)
 
 
-# Below this shift of the features, the rotation compensated, a pair is a turn on the spot: no direction can be told.
-MIN_PARALLAX_PX = 3.0
-# Too few matches, or matches in a corner, leave the estimate itself uncertain by more than the limits.
-MIN_RELATIVE_MATCHES = 60
-MAX_ERROR_PX = 1.5
-PAIRS_OF_A_FRAME = 6
-
-
 @dataclass(frozen=True)
 class RelativePoses:
     """What the pictures alone say of k pairs: second camera from first, opencv axes."""
@@ -173,7 +172,7 @@ def relative_errors(estimated: RelativePoses, poses: Float) -> tuple[Float, Floa
     camera = habitat_to_opencv(poses)
     from_first = np.linalg.inv(camera[estimated.second]) @ camera[estimated.first]
     between = np.einsum("kij,klj->kil", from_first[:, :3, :3], estimated.rotation)
-    rotation_deg = np.degrees(_rotation_angle(between))
+    rotation_deg = np.degrees(Rotation.from_matrix(between).magnitude())
     moved = np.linalg.norm(from_first[:, :3, 3], axis=-1)
     cosine = np.einsum("ki,ki->k", from_first[:, :3, 3], estimated.direction) / np.maximum(moved, 1e-9)
     return rotation_deg, np.degrees(np.arccos(np.clip(cosine, -1, 1)))
@@ -198,19 +197,6 @@ def _chosen_pairs(matches: Matches) -> list[tuple[int, int, Float]]:
             pixels = [matches.features[p][pair.features[:, k]] for k, p in enumerate((pair.first, pair.second))]
             chosen.append((pair.first, pair.second, np.array(pixels)))
     return chosen
-
-
-def _rotation_angle(rotation: Float) -> Float:
-    """`(k,)` radians of `(k, 3, 3)` rotations; exact for small angles too."""
-    sine = np.stack(
-        [
-            rotation[:, 2, 1] - rotation[:, 1, 2],
-            rotation[:, 0, 2] - rotation[:, 2, 0],
-            rotation[:, 1, 0] - rotation[:, 0, 1],
-        ],
-        axis=-1,
-    )
-    return np.arctan2(np.linalg.norm(sine, axis=-1), np.trace(rotation, axis1=-2, axis2=-1) - 1)
 
 
 def _turn(rays: Float, intrinsics: Intrinsics) -> tuple[Float, float]:

@@ -1,0 +1,240 @@
+"""The figures that are curves and points: training, PSNR by views, visibility; and how all figures look."""
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from avp_experiment.configuration import ROOMS, TRAIN, UNSEEN
+from avp_experiment.results import Key, Results, Training
+from avp_experiment.statistics import PREDICTORS, Point, correlations, points_of, summary
+from avp_habitat.metrics import FIGURES
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+CPV, REWARD = "avp/cpv", "rollout/ep_rew_mean"
+_MILLION = 1e6
+_ROLES = {TRAIN: "scene of training", UNSEEN: "unseen scene"}
+WIDTH_IN = 9.6
+_DPI = 100
+
+
+class Missing(Exception):
+    """A figure that cannot be made; the text says why."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure with what is to be said below it."""
+
+    picture: "Figure"
+    """Not written yet."""
+    caption: str
+    """What is plotted, of how many seeds and starts."""
+
+    def save(self, path: Path) -> None:
+        """Write a PNG of 256 colours, which keeps photographs small."""
+        drawn = io.BytesIO()
+        self.picture.savefig(drawn, dpi=_DPI, format="png")
+        Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+# Colours of Okabe and Ito (https://jfly.uni-koeln.de/color/), which people with colour blindness can tell apart, with a
+# dark purple and greys beside them; markers differ too.
+_STYLES = {
+    "heuristic": ("#000000", "X"),
+    "random": ("#8C8C8C", "v"),
+    "spin": ("#BBBBBB", "<"),
+    "survey": ("#5F5F5F", ">"),
+    "frontier": ("#E69F00", "s"),
+    "greedy": ("#CC79A7", "D"),
+    "oracle": ("#009E73", "P"),
+    "coverage": ("#56B4E9", "^"),
+    "coverage_redundancy": ("#0072B2", "p"),
+    "proposed": ("#D55E00", "o"),
+    "surface": ("#661F77", "h"),
+}
+_OTHER = ("#A08060", "8")
+
+
+def style_of(method: str) -> tuple[str, str, str]:
+    """Colour, marker and line of a method; of one trained in generated rooms its reward's, dashed."""
+    return *_STYLES.get(method.removesuffix(ROOMS), _OTHER), "--" if method.endswith(ROOMS) else "-"
+
+
+def new_figure(height_in: float) -> "Figure":
+    """An empty picture of the common width."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+
+
+def cpv_while_training(results: Results) -> Drawn:
+    """Figure 3: coverage per view while training."""
+    trained = _trained(results, CPV)
+    picture = new_figure(4.4)
+    axes = picture.subplots()
+    for method, trainings in trained.items():
+        _training_curve(axes, method, trainings, CPV)
+    axes.set(xlabel="environment steps while training [millions]", ylabel="CpV [% coverage per view]")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower right", ncols=2, fontsize=9)
+    return Drawn(picture, f"Coverage per view of the episodes finished while training. {_bands(trained)}")
+
+
+def reward_while_training(results: Results) -> Drawn:
+    """Figure 4: mean reward of an episode while training, each reward on its own scale."""
+    trained = _trained(results, REWARD)
+    columns = min(3, len(trained))
+    rows = -(-len(trained) // columns)
+    picture = new_figure(0.4 + 2.4 * rows)
+    panels = list(np.ravel(picture.subplots(rows, columns, squeeze=False)))
+    for axes, (method, trainings) in zip(panels, trained.items(), strict=False):
+        _training_curve(axes, method, trainings, REWARD)
+        axes.set_title(method, fontsize=10)
+        axes.grid(alpha=0.3)
+    for axes in panels[len(trained) :]:
+        axes.set_axis_off()
+    picture.supxlabel("environment steps while training [millions]", fontsize=10)
+    picture.supylabel("mean reward of an episode", fontsize=10)
+    return Drawn(
+        picture,
+        "Mean reward of the episodes finished while training. Rewards differ in what they count, so each panel has its "
+        f"own scale, and heights cannot be compared between panels. {_bands(trained)}",
+    )
+
+
+def psnr_by_views(results: Results) -> Drawn:
+    """PSNR of reconstructions from each episode's first k frames."""
+    scored = {one.role for one in results.reconstructions if "psnr" in one.scores}
+    roles = [role for role in _ROLES if role in scored]
+    if not roles:
+        raise Missing("no reconstruction has a PSNR")
+    picture = new_figure(4.9)
+    panels = picture.subplots(1, len(roles), squeeze=False, sharey=False)[0]
+    for axes, role in zip(panels, roles, strict=True):
+        for method in results.methods:
+            _psnr_curve(axes, method, _psnr_points(results, method, role))
+        axes.set(xlabel="views (frames used)", ylabel="PSNR on held-out views [dB]")
+        axes.set_title(f"{_ROLES[role]}: {', '.join(results.scenes(role))}", fontsize=10)
+        axes.grid(alpha=0.3)
+    _legend(picture, panels)
+    return Drawn(
+        picture,
+        "PSNR of reconstructions from the first k frames of an episode; the last point of a line is the whole episode, "
+        f"at its mean number of views. Means over {results.seeds}, of the episodes that were also "
+        "reconstructed in part; bars: 95 % confidence interval over seeds (Student's t). A "
+        "point is left out where some of these episodes ended before.",
+    )
+
+
+def visibility_and_psnr(results: Results) -> Drawn:
+    """Visibility against PSNR of all reconstructions, beside coverage against PSNR."""
+    points = points_of(results)
+    if not points:
+        raise Missing("no reconstruction has both a visibility and a PSNR")
+    picture = new_figure(5.4)
+    panels = picture.subplots(1, 2, sharey=True)
+    for axes, name in zip(panels, PREDICTORS, strict=True):
+        for method in results.methods:
+            _scatter(axes, [point for point in points if point.method == method], name)
+        axes.set_xlabel(FIGURES[name].heading)
+        axes.grid(alpha=0.3)
+        axes.set_title(_correlation_title(points, name), fontsize=10)
+    panels[0].set_ylabel("PSNR on held-out views [dB]")
+    _legend(picture, panels[:1])
+    whole = sum(point.whole for point in points)
+    return Drawn(
+        picture,
+        f"All {len(points)} reconstructions, of {results.seeds}: large points are the {whole} of whole "
+        f"episodes, small pale ones the {len(points) - whole} of first frames. Left: share of the held-out pixels that "
+        "the frames have seen; right: share of the floor cells observed. ρ is Spearman's, with a 95 % interval "
+        "(bootstrap over rollouts).",
+    )
+
+
+def _trained(results: Results, metric: str) -> dict[str, list[Training]]:
+    """By method in the tables' order: the trainings that have a curve."""
+    having = [one for one in results.training if len(one.curves.get(metric, [])) > 1]
+    if not having:
+        raise Missing(f"no training has a curve of {metric}")
+    found = {method: [one for one in having if one.method == method] for method in results.methods}
+    return {method: trainings for method, trainings in found.items() if trainings}
+
+
+def _bands(trained: dict[str, list[Training]]) -> str:
+    counts = sorted({len(trainings) for trainings in trained.values()})
+    seeds = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
+    return f"Lines: mean over {seeds} seeds; bands: from the lowest seed to the highest."
+
+
+def _training_curve(axes: "Axes", method: str, trainings: Sequence[Training], metric: str) -> None:
+    """Mean over seeds at common steps, with a band from the lowest to the highest."""
+    curves = [one.curves[metric] for one in trainings]
+    steps = np.linspace(max(curve[0, 0] for curve in curves), min(curve[-1, 0] for curve in curves), 200)
+    values = np.array([np.interp(steps, curve[:, 0], curve[:, 1]) for curve in curves])
+    colour, _, line = style_of(method)
+    axes.plot(steps / _MILLION, values.mean(axis=0), line, color=colour, label=method, linewidth=1.8)
+    if len(values) > 1:
+        low, high = values.min(axis=0), values.max(axis=0)
+        axes.fill_between(steps / _MILLION, low, high, color=colour, alpha=0.18, linewidth=0)
+
+
+def _psnr_points(results: Results, method: str, role: str) -> list[tuple[float, dict[Key, float]]]:
+    """Number of views, and PSNR by episode: of the first frames where all episodes have so many, and of all frames."""
+    episodes = results.reconstruction_curves(method, role)
+    scored = [(key, one) for key, curve in episodes.items() for one in curve.values() if "psnr" in one.scores]
+    first: dict[int, dict[Key, float]] = {}
+    for key, one in scored:
+        if not one.whole:
+            first.setdefault(one.frames, {})[key] = one.scores["psnr"]
+    points = [(float(views), first[views]) for views in sorted(first) if len(first[views]) == len(episodes)]
+    whole = [(key, one) for key, one in scored if one.whole]
+    if whole:
+        views = float(np.mean([one.frames for _, one in whole]))
+        points.append((views, {key: one.scores["psnr"] for key, one in whole}))
+    return points
+
+
+def _psnr_curve(axes: "Axes", method: str, points: Sequence[tuple[float, dict[Key, float]]]) -> None:
+    found = {views: over_seeds for views, values in points if (over_seeds := summary(values))}
+    if not found:
+        return
+    halves = np.array([one.half_width for one in found.values()])
+    colour, marker, line = style_of(method)
+    look: dict[str, Any] = {"color": colour, "linewidth": 1.6, "elinewidth": 0.8, "markersize": 5.5, "label": method}
+    look["markerfacecolor"] = colour if line == "-" else "white"
+    spread = None if np.isnan(halves).all() else np.nan_to_num(halves)
+    means = [one.mean for one in found.values()]
+    for bar in axes.errorbar(list(found), means, yerr=spread, fmt=marker + line, **look)[2]:
+        bar.set_alpha(0.45)
+
+
+def _scatter(axes: "Axes", points: Sequence[Point], name: str) -> None:
+    for whole in (False, True):
+        chosen = [point for point in points if point.whole is whole]
+        if not chosen:
+            continue
+        colour, marker, line = style_of(chosen[0].method)
+        look: dict[str, Any] = {"marker": marker, "edgecolors": colour, "facecolors": colour if line == "-" else "none"}
+        look |= {"s": 46, "alpha": 0.9} if whole else {"s": 16, "alpha": 0.4}
+        shares = [FIGURES[name].scale * point.shares[name] for point in chosen]
+        label = chosen[0].method if whole or len(chosen) == len(points) else None
+        axes.scatter(shares, [point.psnr for point in chosen], label=label, linewidths=1.1, **look)
+
+
+def _correlation_title(points: Sequence[Point], name: str) -> str:
+    found = correlations(points, name)
+    lines = [f"{where}: {found[where] or 'too few points'}" for where in ("all", "whole episodes")]
+    return "\n".join([f"{name} and PSNR", *lines])
+
+
+def _legend(picture: "Figure", panels: Any) -> None:
+    handles = {label: one for axes in panels for one, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    picture.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=6, fontsize=8)

@@ -1,0 +1,106 @@
+"""Small maps of the floor that an agent has observed, around it and turned to its heading."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.compiled import njit
+from avp_habitat.navigation.area import NavigableArea
+
+SIDE = 20
+"""Map cells along a side; the agent stands in the middle, its heading points to row 0."""
+CELL_M = 0.4
+"""Side of a map cell in metres."""
+CHANNELS = ("observed", "frontier", "rim")
+"""observed: share of the map cell's ground that is observed floor. frontier: observed floor beside floor that is not
+yet observed. rim: observed floor beside what is not navigable. The last two are lengths in sides of a map cell, up to
+1."""
+SIZE = len(CHANNELS) * SIDE * SIDE
+OBSERVED, FRONTIER, RIM = range(len(CHANNELS))
+
+
+@njit(cache=True)
+def draw(index, first_seen, rows, place, yaw, scale, maps):
+    """Count floor cells by channel and map cell.
+
+    Args:
+        index: `(rows + 2, columns + 2)` number of each navigable cell, -1 elsewhere, with a border of -1.
+        first_seen: `(n, >= m)` 0 for cells not observed.
+        rows: `(k,)` the agents' rows of it.
+        place: `(k, 2)` x and z of the agents in floor cells from the grid's corner.
+        yaw: `(k,)` radians.
+        scale: floor cells along a map cell's side.
+        maps: `(k, 3, side, side)` output, zeros before.
+    """
+    for k in range(len(rows)):
+        seen = first_seen[rows[k]]
+        ahead_x, ahead_z = -np.sin(yaw[k]) / scale, -np.cos(yaw[k]) / scale
+        for i in range(1, index.shape[0] - 1):
+            for j in range(1, index.shape[1] - 1):
+                if index[i, j] >= 0 and seen[index[i, j]] != 0:
+                    x, z = j - 0.5 - place[k, 0], i - 0.5 - place[k, 1]
+                    ahead, right = x * ahead_x + z * ahead_z, z * ahead_x - x * ahead_z
+                    _enter(maps[k], ahead, right, *_edges(index, seen, i, j))
+
+
+@njit(cache=True)
+def _edges(index, seen, i, j):
+    """Whether an observed cell lies beside floor not yet observed, and beside what is not navigable."""
+    frontier, rim = False, False
+    for di, dj in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+        other = index[i + di, j + dj]
+        if other < 0:
+            rim = True
+        elif seen[other] == 0:
+            frontier = True
+    return frontier, rim
+
+
+@njit(cache=True)
+def _enter(channels, ahead, right, frontier, rim):
+    """Count an observed cell at a place in map cells from the agent; frontiers beyond the map on its border."""
+    side = channels.shape[1]
+    row, column = int(np.floor(side / 2 - ahead)), int(np.floor(side / 2 + right))
+    if 0 <= row < side and 0 <= column < side:
+        channels[OBSERVED, row, column] += 1
+        channels[RIM, row, column] += rim
+    if frontier:
+        channels[FRONTIER, min(max(row, 0), side - 1), min(max(column, 0), side - 1)] += 1
+
+
+class MapObserver:
+    """Draws the maps of agents in one scene."""
+
+    def __init__(self, area: NavigableArea) -> None:
+        """Number the scene's cells."""
+        self._origin = area.origin
+        self._cell_m = area.cell_m
+        # A border of cells outside, so that every cell has four neighbours.
+        self._index = np.full((area.mask.shape[0] + 2, area.mask.shape[1] + 2), -1, dtype=np.int32)
+        self._index[1:-1, 1:-1][area.mask] = np.arange(np.count_nonzero(area.mask))
+
+    def observe(
+        self,
+        first_seen: NDArray[np.int16],
+        rows: NDArray[np.integer],
+        position: NDArray[np.floating],
+        yaw: NDArray[np.floating],
+    ) -> NDArray[np.float32]:
+        """The maps of k agents.
+
+        Args:
+            first_seen: `(n, >= m)` 0 for cells not observed.
+            rows: `(k,)` the agents' rows of it.
+            position: `(k, 3)` their feet, metres.
+            yaw: `(k,)` radians.
+
+        Returns:
+            `(k, SIZE)` within [0, 1], channel after channel, row after row from ahead to behind, left to right. What
+            lies beyond the map is drawn on its border, frontiers only.
+        """
+        maps = np.zeros((len(rows), len(CHANNELS), SIDE, SIDE), dtype=np.float32)
+        place = (np.asarray(position)[:, [0, 2]] - self._origin) / self._cell_m
+        per_side = CELL_M / self._cell_m
+        draw(self._index, first_seen, rows, place, np.asarray(yaw), per_side, maps)
+        maps[:, 0] /= per_side**2
+        maps[:, 1:] /= per_side
+        return np.minimum(maps, 1.0).reshape(len(rows), SIZE)

@@ -1,0 +1,58 @@
+"""An experiment's folder of before the packages' layout changed (tests/data/before) still opens."""
+
+import json
+import re
+import shutil
+import tarfile
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from avp_experiment import compare, report
+from avp_experiment.cells import TRAIN, plan
+from avp_experiment.configuration import PRESETS
+from avp_experiment.folder import open_folder
+from avp_experiment.results import gather
+from avp_habitat import command
+
+SAMPLE = Path(__file__).resolve().parent / "data" / "before" / "experiment.tar.xz"
+
+
+@pytest.fixture(scope="module")
+def before(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("before")
+    with tarfile.open(SAMPLE) as archive:
+        archive.extractall(folder, filter="data")
+    return folder / "experiment"
+
+
+def words_of(page):
+    """A page without what the new layout says in other words."""
+    page = page.replace("path [m]", "path length [m]").replace("python -m experiment", "python -m avp_experiment")
+    return re.sub(r"[ -]+", " ", page)
+
+
+def test_its_tables_claims_and_page_are_what_they_were(before, tmp_path):
+    folder = shutil.copytree(before, tmp_path / "e")
+    assert command.run(report.main, [str(folder)]) == 0
+    for name in ("table2.md", "table2.csv", "claims.md", "results.md"):
+        assert words_of((folder / name).read_text()) == words_of((before / name).read_text()), name
+
+
+def test_nothing_of_it_is_done_again_and_the_same_results_are_gathered(before, tmp_path, monkeypatch):
+    folder = shutil.copytree(before, tmp_path / "e")
+    small = {"steps": 6144, "size": (32, 24), "iterations": 10, "budget": 6, "prefixes": (3,), "heldout_pictures": (3,)}
+    monkeypatch.setitem(PRESETS, "smoke", replace(PRESETS["smoke"], **small))
+    options = compare.Compare(preset="smoke", unseen="none", methods="heuristic,proposed")
+    configuration = options.configuration()
+    kept = open_folder(configuration, folder)
+    cells = plan(configuration, folder, tracking="avp")
+    assert [cell.kind for cell in cells].count(TRAIN) == 1
+    assert all(kept.is_done(cell) for cell in cells)
+    known, found = (
+        json.loads((before / "results.json").read_text()),
+        gather(configuration, kept, cells, command="again"),
+    )
+    for part in ("configuration", "methods", "training", "rollouts", "reconstructions", "failed"):
+        assert json.loads(json.dumps(found[part])) == known[part], part
