@@ -53,7 +53,7 @@ def main(options: Demo) -> None:
     line = shlex.join(["python", "examples/demo.py", *sys.argv[1:]])
     compare(configuration, out, jobs=len(os.sched_getaffinity(0)), line=line)
 
-    from avp_sb3.rerun.recording import write_rollout_recording
+    from avp_sb3.rerun.rollout import write_rollout_recording
 
     slug = scene_slug(configuration.scenes[0].name)
     rollouts = [out / "cells" / "collect" / f"{method.name}-{slug}-0-0" / "rollout" for method in configuration.methods]
