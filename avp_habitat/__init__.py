@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from avp_habitat.recording import RecordRollout
     from avp_habitat.rollout.format import Rollout, read_rollout
     from avp_habitat.scenes.location import Frame
-    from avp_habitat.sight.coverage import visible_in_depth
+    from avp_habitat.sight.rules import visible_in_depth
     from avp_habitat.simulators.base import Frames, Simulator, SingleRays
     from avp_habitat.simulators.registry import make_simulator
     from avp_habitat.task.agent_view import AgentView, agent_views
@@ -81,7 +81,7 @@ _HOME = {
     "pixel_directions": "poses",
     "read_rollout": "rollout.format",
     "reward": "task.rewards",
-    "visible_in_depth": "sight.coverage",
+    "visible_in_depth": "sight.rules",
 }
 ENV_ID = "AVP-v0"
 

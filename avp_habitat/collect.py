@@ -15,8 +15,9 @@ from avp_habitat.errors import RolloutError
 from avp_habitat.files import check_writable
 from avp_habitat.gpu import nerfacto_line
 from avp_habitat.metrics import METRICS_HELP
+from avp_habitat.plugins import name_of
 from avp_habitat.policies.registry import (
-    POLICY_NAMES,
+    POLICIES_HELP,
     TRUSTED,
     check_policy,
     described,
@@ -29,8 +30,8 @@ from avp_habitat.rollout.capture import VIEWS, capture_heldout, capture_step, pu
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
-from avp_habitat.task.rewards import REWARD_NAMES
-from avp_habitat.task.settings import TaskSettings
+from avp_habitat.task.rewards import REWARDS_HELP
+from avp_habitat.task.settings import OBSERVATIONS_HELP, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
 from avp_habitat.tracking.rollout_run import command_for, rollout_run
 from avp_habitat.tracking.stores import TrackingError, about_run, address_of, open_store, shown
@@ -44,10 +45,14 @@ class Collect:
     """
 
     scene: Annotated[str, arg(help=SCENES)]
-    policy: Annotated[str, arg(help=f"{', '.join(POLICY_NAMES)}, or a PPO model (.zip)")]
+    policy: Annotated[str, arg(help=POLICIES_HELP)]
     out: Path
     """The rollout folder to write; must not exist."""
-    reward: Annotated[str, arg(help=", ".join(REWARD_NAMES))] = "proposed"
+    reward: Annotated[str, arg(help=REWARDS_HELP)] = "proposed"
+    observation: Annotated[
+        str | None,
+        arg(help=f"{OBSERVATIONS_HELP} (omitted: the first that fits the policy)"),
+    ] = None
     simulator: SimulatorChoice = field(default_factory=SimulatorChoice)
     """Which simulator opens the scene."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
@@ -102,7 +107,14 @@ def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: 
     settings = settings or _settings(options)
     with RolloutWriter(options.out, options.camera) as writer:
         simulator = open_simulator(options.simulator, options.scene)
-        env, policy = make_policy_env(options.policy, simulator, settings, seed=options.seed, trusted=options.trusted)
+        env, policy = make_policy_env(
+            options.policy,
+            simulator,
+            settings,
+            seed=options.seed,
+            observation=options.observation,
+            trusted=options.trusted,
+        )
         with progress(total=settings.budget + heldout, unit="view", desc=f"collecting {options.out}") as bar:
             info: dict[str, Any] = {}
             for step in steps_of(env, policy, seed=options.seed, deterministic=not options.stochastic):
@@ -115,7 +127,7 @@ def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: 
             env,
             writer,
             info,
-            policy={"name": Path(options.policy).name, "deterministic": not options.stochastic},
+            policy={"name": Path(name_of(options.policy)).name, "deterministic": not options.stochastic},
             seed=options.seed,
             heldout=heldout,
             mlflow_run_id=getattr(policy, "avp_mlflow_run_id", None) or os.environ.get("MLFLOW_RUN_ID"),

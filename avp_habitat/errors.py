@@ -41,6 +41,10 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UsageError:
         known: every accepted name.
     """
     names = sorted(known)
-    near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    return UsageError(f"unknown {kind} {name!r}: expected one of {', '.join(names)}{hint}")
+    return UsageError(f"unknown {kind} {name!r}: expected one of {', '.join(names)}{did_you_mean(name, names)}")
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """The end of an error's text: the nearest known name, if one is near."""
+    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f"; did you mean {near[0]!r}?" if near else ""

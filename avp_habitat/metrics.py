@@ -12,9 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from avp_habitat import plugins
 from avp_habitat.errors import UsageError
-from avp_habitat.sight.visibility import ALIKE_DEG, ALIKE_DISTANCE, PARALLAX_DEG
 
 Float = NDArray[np.floating]
+
+
+ALIKE_DEG = 60.0
+"""A frame sees a surface as the held-out view does when its ray is turned by no more than this, degrees."""
+ALIKE_DISTANCE = 2.0
+"""And when it stands no more than this many times as far away."""
+PARALLAX_DEG = 10.0
+"""Rays this far apart show how far away a surface is, degrees."""
 
 
 @dataclass(frozen=True)
@@ -163,19 +170,24 @@ def measured(chosen: Iterable[str | MetricFunction], of: Of, thing: Any) -> dict
     return values
 
 
-def figures(chosen: Iterable[str | MetricFunction] = ()) -> dict[str, Figure]:
-    """All figures by name: the suite's, those of the chosen metrics, and those that other distributions register.
+def figures(chosen: Sequence[str | MetricFunction] = ()) -> dict[str, Figure]:
+    """All figures by name: the suite's, those that other distributions register, and those of the chosen metrics.
 
-    A registered metric that cannot be imported is left out: what it measured is then shown by nobody.
+    A registered metric that cannot be imported is left out: what it measured is then shown by its key.
 
     Args:
-        chosen: metrics that are named by `module:function`, or given as they are.
+        chosen: metrics, for those that are named by `module:function` or given as they are.
     """
-    own = {function.figure.name: function.figure for function in find_metrics(tuple(chosen))}
+    found = []
     for name in plugins.names("avp.metrics", ()):
         with suppress(UsageError):
-            own |= {function.figure.name: function.figure for function in find_metrics((name,))}
-    return FIGURES | own
+            found += find_metrics((name,))
+    return FIGURES | {function.figure.name: function.figure for function in [*found, *find_metrics(tuple(chosen))]}
+
+
+def figure_of(name: str) -> Figure:
+    """How a figure is called and shown; one that nobody registers, by its key."""
+    return figures().get(name) or Figure(name, name.replace("_", " "), digits=3)
 
 
 def coverage(observed: NDArray[np.bool_], navigable: NDArray[np.bool_]) -> float:

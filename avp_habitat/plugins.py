@@ -1,16 +1,15 @@
 """What is chosen by name: built in, `module:object`, or registered by another installed distribution."""
 
-import difflib
 import os
 import pkgutil
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
-from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.errors import UsageError, did_you_mean, unknown_name
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 KINDS = {
@@ -38,7 +37,7 @@ def find(group: str, name: Any, known: Mapping[str, Any]) -> Any:
     if not isinstance(name, str):
         return name
     kind, others = KINDS[group], [point for point in _registered(group) if point.name == name]
-    owners = [*(["avp-suite (built in)"] if name in known else []), *(_owner(point) for point in others)]
+    owners = ["avp-suite (built in)"] * (name in known) + [_owner(point) for point in others]
     if len(owners) > 1:
         raise UsageError(f"{kind} {name!r}: expected one distribution to register it, found {' and '.join(owners)}")
     if others:
@@ -68,7 +67,7 @@ def names(group: str, known: Iterable[str]) -> list[str]:
 
 
 def name_of(thing: Any) -> str:
-    """The text under which a thing is stored: its name, or `module:qualname` of an object."""
+    """The text under which a thing is stored: its name, or `module:name` of an object."""
     if isinstance(thing, str):
         return thing
     named = thing if hasattr(thing, "__qualname__") else type(thing)
@@ -76,7 +75,7 @@ def name_of(thing: Any) -> str:
 
 
 @cache
-def _all_registered() -> EntryPoints:
+def _all_registered() -> Any:
     return entry_points()
 
 
@@ -97,16 +96,11 @@ def _load(kind: str, name: str, reference: str) -> Any:
         found = import_module(module)
     except Exception as error:  # A user's module may raise anything.
         missing = isinstance(error, ModuleNotFoundError) and error.name == module
-        near = _nearest(module, (each.name for each in pkgutil.iter_modules([folder]))) if missing else ""
+        near = did_you_mean(module, (each.name for each in pkgutil.iter_modules([folder]))) if missing else ""
         why = " ".join(f"{type(error).__name__}: {error}".split())
         raise UsageError(f"{kind} {name!r}: expected a module that can be imported, got {why}{near}") from error
     for part in path.split("."):
         if not hasattr(found, part):
-            raise UsageError(f"{kind} {name!r}: {module} has no {path!r}{_nearest(part, vars(found))}")
+            raise UsageError(f"{kind} {name!r}: {module} has no {path!r}{did_you_mean(part, vars(found))}")
         found = getattr(found, part)
     return found
-
-
-def _nearest(name: str, known: Iterable[str]) -> str:
-    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f"; did you mean {near[0]!r}?" if near else ""

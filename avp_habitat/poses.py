@@ -1,4 +1,4 @@
-"""Axes, camera poses and pinhole projection: the only module that flips a sign.
+"""Axes, camera poses and pinhole projection: the only module that flips a sign, but for `sight.rules.in_camera`.
 
 World: right-handed, metres, Y up, the floor is the X-Z plane (Habitat's). Yaw is about +Y, 0 looks along -Z, left is
 positive; pitch is positive upwards; both in radians. A pose is `camera_to_world`, 4x4. Camera axes are *habitat*
@@ -153,33 +153,7 @@ def project(points: Float, pose: Float, intrinsics: Intrinsics) -> tuple[Float, 
         `(n, m, 2)` pixel coordinates (x right, y down, pixel centres at +0.5; meaningless behind the camera) and
         `(n, m)` planar depth in metres, negative behind the camera.
     """
-    offset = points[None] - pose[:, None, :3, 3]
-    return _pinhole(np.einsum("nij,nmi->nmj", pose[:, :3, :3], offset), intrinsics)
-
-
-def project_pairs(points: Float, pose: Float, intrinsics: Intrinsics) -> tuple[Float, Float]:
-    """Project the i-th of `(k, 3)` points into the i-th of `(k, 4, 4)` cameras.
-
-    Returns:
-        `(k, 2)` pixel coordinates and `(k,)` planar depth, as `project` gives them.
-    """
-    return _pinhole(np.einsum("kij,ki->kj", pose[:, :3, :3], points - pose[:, :3, 3]), intrinsics)
-
-
-def in_image(pixel: Float, depth: Float, intrinsics: Intrinsics) -> NDArray[np.bool_]:
-    """Which projected points lie in front of the camera and inside its image; the right and lower borders are outside.
-
-    Args:
-        pixel: `(..., 2)` pixel coordinates, as `project` and `project_pairs` give them.
-        depth: `(...)` planar depth in metres.
-        intrinsics: of the camera.
-    """
-    u, v = pixel[..., 0], pixel[..., 1]
-    return (depth > 0) & (u >= 0) & (u < intrinsics.width) & (v >= 0) & (v < intrinsics.height)
-
-
-def _pinhole(local: Float, intrinsics: Intrinsics) -> tuple[Float, Float]:
-    """Pixels `(..., 2)` and planar depth `(...)` of points `(..., 3)` in habitat camera axes."""
+    local = np.einsum("nij,nmi->nmj", pose[:, :3, :3], points[None] - pose[:, None, :3, 3])
     depth = -local[..., 2]
     safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
     u = intrinsics.fx * local[..., 0] / safe + intrinsics.cx

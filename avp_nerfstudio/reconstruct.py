@@ -14,8 +14,8 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from avp_habitat import command
-from avp_habitat.errors import RolloutError, UsageError
-from avp_habitat.files import NewFolder
+from avp_habitat.errors import AVPError, RolloutError, UsageError
+from avp_habitat.files import atomic_folder
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.format import Rollout, read_rollout
 from avp_habitat.tracking.stores import address_of, open_store
@@ -67,7 +67,7 @@ def reconstruct(options: Reconstruction) -> dict[str, Any]:
         AVPError: the folder cannot be written, or MLflow cannot be reached; nothing is left behind.
     """
     started = time.monotonic()
-    with NewFolder(options.out) as folder:
+    with atomic_folder(options.out, failure=AVPError, option="--out") as folder:
         rollout = read_rollout(options.rollout)
         _check_rollout(options, rollout)
         address = address_of(options.mlflow, default=None)
@@ -78,9 +78,7 @@ def reconstruct(options: Reconstruction) -> dict[str, Any]:
             warnings.simplefilter("ignore")
             from avp_nerfstudio.method.reconstruction import process
 
-            found = process(options, rollout, folder, started=started, address=address)
-        folder.publish()
-    return found
+            return process(options, rollout, folder, started=started, address=address)
 
 
 def _check_rollout(options: Reconstruction, rollout: Rollout) -> None:

@@ -12,13 +12,14 @@ from tyro.conf import arg
 from avp_habitat import command
 from avp_habitat.errors import UsageError
 from avp_habitat.files import check_writable
+from avp_habitat.metrics import METRICS_HELP
 from avp_habitat.policies.registry import TRUSTED, load_model
 from avp_habitat.policies.saved_model import is_normalised, load_statistics, statistics_of
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.simulators.registry import SimulatorChoice
-from avp_habitat.task.rewards import REWARD_NAMES
-from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
+from avp_habitat.task.rewards import REWARDS_HELP
+from avp_habitat.task.settings import OBSERVATIONS_HELP, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
 from avp_sb3.presets import MAP, PRESETS, Preset
 
@@ -34,8 +35,9 @@ class Train:
     """
 
     scene: Annotated[tuple[str, ...], arg(help=f"{SCENES}; agents share several")] = ("builtin:0",)
-    reward: Annotated[str, arg(help=", ".join(REWARD_NAMES))] = "proposed"
-    observation: Annotated[str, arg(help=f"{', '.join(OBSERVATION_NAMES)}; also chooses PPO's settings")] = "numbers"
+    reward: Annotated[str, arg(help=REWARDS_HELP)] = "proposed"
+    observation: Annotated[str, arg(help=f"{OBSERVATIONS_HELP}; also chooses PPO's settings")] = "numbers"
+    metrics: Annotated[tuple[str, ...], arg(help=METRICS_HELP)] = ()
     steps: Annotated[int, Range(1, _MOST)] = 300_000
     """Environment steps in total."""
     agents: int | None = None
@@ -88,6 +90,7 @@ class Train:
         return TaskSettings(
             reward=self.reward,
             observation=self.observation,
+            metrics=self.metrics,
             lookup=not self.rays and self.simulator.single_rays,
             width=self.width,
             height=self.height,
@@ -168,7 +171,7 @@ def _callbacks(options: Train, tracking: Any) -> list[Any]:
     # First, so that scenes that cannot be opened leave no empty run behind.
     if options.eval_scene is not None:
         best = options.out.with_stem(f"{options.out.stem}-best")
-        where = vars(options.simulator) | {"navmesh": None}  # That is the training scene's.
+        where: dict[str, Any] = vars(options.simulator) | {"navmesh": None}  # That is the training scene's.
         callbacks.append(EvaluationCallback(options.eval_scene, every=options.eval_every, best_model=best, **where))
     callbacks += [MetricsCallback(), tracking]
     if options.recording is not None:

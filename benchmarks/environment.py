@@ -25,7 +25,7 @@ from avp_habitat import command
 from avp_habitat.errors import UsageError
 from avp_habitat.scenes.loader import load_scene
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.sight.rows import ENVIRONMENT as CACHE
+from avp_habitat.sight.lattice import CACHE_VARIABLE as CACHE
 from avp_habitat.sight.tables import scene_tables
 from avp_habitat.task.settings import ACTION_NAMES, TaskSettings
 from avp_sb3.vec_env.batched import AVPVecEnv
@@ -110,8 +110,8 @@ def _build_tables(simulator: RecordingSimulator, settings: TaskSettings) -> dict
         "cells": len(area.centres),
         "area_m2": area.area_m2,
         "build_s": time.perf_counter() - start,
-        "places": len(tables.visible),
-        "memory_mb": (tables.visible.nbytes + tables.statistics.nbytes) / 1e6,
+        "places": len(tables.columns["visible"]),
+        "memory_mb": sum(column.nbytes for column in tables.columns.values()) / 1e6,
     }
 
 

@@ -29,9 +29,9 @@ from avp_habitat.scenes.export import export_glb
 from avp_habitat.scenes.loader import load_scene
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.scenes.mesh import TexturedMesh
-from avp_habitat.sight.rows import ENVIRONMENT as CACHE
-from avp_habitat.sight.rows import TILE, Lattice
-from avp_habitat.sight.tables import SceneTables, scene_tables
+from avp_habitat.sight.lattice import CACHE_VARIABLE as CACHE
+from avp_habitat.sight.lattice import TILE, Lattice, PlaceTable
+from avp_habitat.sight.tables import scene_tables
 from avp_habitat.simulators.raycast import RaycastSimulator
 from avp_habitat.task.settings import ACTION_NAMES, TaskSettings
 from avp_habitat.task.task import ViewpointTask
@@ -189,14 +189,14 @@ def _middle(centres: NDArray[np.floating], count: int) -> NDArray[np.floating]:
     return centres[np.argsort(away, kind="stable")[: max(1, count)]]
 
 
-def _make_tables(tables: SceneTables, places: NDArray[np.floating], folder: Path) -> dict[str, float]:
+def _make_tables(tables: PlaceTable, places: NDArray[np.floating], folder: Path) -> dict[str, float]:
     """Tables for some places, and what the whole scene would cost at the same cost per place."""
     start = time.perf_counter()
     tables.around(places)
     took = time.perf_counter() - start
-    made = len(tables.visible)
-    made_m2 = made * tables.key.spacing_m**2
-    memory_mb = (tables.visible.nbytes + tables.statistics.nbytes) / 1e6
+    made = len(tables.columns["visible"])
+    made_m2 = made * tables.lattice.spacing_m**2
+    memory_mb = sum(column.nbytes for column in tables.columns.values()) / 1e6
     disk_mb = sum(file.stat().st_size for file in (folder / "tables").rglob("*.npz")) / 1e6
     share = made / _all_places(tables.lattice)
     return {

@@ -25,7 +25,7 @@ from tqdm import tqdm
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.sight.rows import ENVIRONMENT as CACHE
+from avp_habitat.sight.lattice import CACHE_VARIABLE as CACHE
 from avp_habitat.task.rewards import find_reward
 from avp_sb3.presets import TABLE_4
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from avp_habitat.poses import pixel_directions
 from avp_habitat.scenes.location import Frame
-from avp_habitat.sight.coverage import pairs_in_image
+from avp_habitat.sight.rules import pairs_in_image
 from avp_habitat.simulators.base import Frames
 
 ROOM = np.array([[0.0, 0.0, 0.0], [6.0, 2.6, 3.0]])

@@ -1,17 +1,19 @@
 """Reading a Rerun recording back with its SDK."""
 
 import subprocess
-import sysconfig
 from pathlib import Path
 
 import numpy as np
+import rerun_cli
 from rerun.chunk import RrdReader
+
+PROGRAM = Path(rerun_cli.__file__).with_name("rerun")
+"""Rerun's own; the script on the path would leave it running when it is stopped."""
 
 
 def verify(path):
     """Rerun's own check."""
-    program = Path(sysconfig.get_path("scripts")) / "rerun"
-    done = subprocess.run([program, "rrd", "verify", path], capture_output=True, text=True)
+    done = subprocess.run([PROGRAM, "rrd", "verify", path], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "verified without error" in done.stdout + done.stderr
 

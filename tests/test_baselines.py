@@ -6,8 +6,8 @@ import pytest
 from corridor import Corridor
 
 from avp_habitat.policies.frontier import Approach, FrontierPlanner, FrontierPolicy, find_frontiers
-from avp_habitat.policies.greedy import GreedyPlanner, Start, expected_cells, expected_views, search
-from avp_habitat.policies.planning import (
+from avp_habitat.policies.greedy import GreedyPlanner, Start, expected_cells, search
+from avp_habitat.policies.known_map import (
     BLOCKED,
     FREE,
     OBSERVED,
@@ -18,8 +18,8 @@ from avp_habitat.policies.planning import (
     shortest_walks,
     walkable,
 )
-from avp_habitat.policies.predicted_views import looking_down, make_lens
-from avp_habitat.policies.reactive import Memory, SpinPlanner
+from avp_habitat.policies.predicted_views import Memory, in_view, looking_down, make_lens
+from avp_habitat.policies.reactive import SpinPlanner
 from avp_habitat.policies.registry import make_policy
 from avp_habitat.poses import camera_to_world, project
 from avp_habitat.simulators.registry import make_simulator
@@ -139,9 +139,9 @@ def test_expected_views_are_those_of_the_cameras_projection_and_lines_without_ob
     cells = np.argwhere(state == UNKNOWN)
     settings = replace(SETTINGS, max_range_m=3.0)
     yaw, pitch, turn = 0.7, np.radians(-30), np.radians(settings.turn_deg)
-    found = expected_views(state, cells, Start(30.3, 20.6, yaw, pitch, turn, 2.5), make_lens(settings, 0.1), turns=4)
     points = np.stack([cells[:, 1] + 0.5, np.zeros(len(cells)), cells[:, 0] + 0.5], axis=1) * 0.1
     yaws = yaw + turn * np.arange(-4, 5)
+    found = np.array([in_view(state, cells, 30.3, 20.6, yaw, pitch, make_lens(settings, 0.1)) for yaw in yaws])
     camera = np.tile([2.06, 1.5, 3.03], (9, 1))
     pixel, depth = project(points, camera_to_world(camera, yaw=yaws, pitch=np.full(9, pitch)), settings.intrinsics)
     inside = (depth > 0) & (pixel >= 0).all(axis=-1) & (pixel <= [settings.width, settings.height]).all(axis=-1)
@@ -176,8 +176,7 @@ def test_the_gain_of_the_best_moves_is_the_brute_force_count_and_close_to_the_gr
                 row, column = to
             else:
                 yaw += turn if move == TURN_LEFT else -turn
-            here = start._replace(row=row, column=column, yaw=yaw)
-            now = expected_views(state, cells, here, lens, turns=0)[0]
+            now = in_view(state, cells, row, column, yaw, start.pitch, lens)
             total += discount**number * np.count_nonzero(now & ~seen)
             seen |= now
         return total
@@ -213,7 +212,7 @@ def test_unknown_floor_is_expected_near_free_floor_but_not_beyond_obstacles():
 def test_walks_are_the_shortest_and_do_not_cut_corners():
     navigable = np.ones((5, 5), dtype=bool)
     navigable[0:4, 2] = False
-    length, before = shortest_walks(navigable, np.array([0, 0]))
+    length, before = shortest_walks(navigable, 0, 0)
     route = route_to(before, np.array([0, 4]))
     # Diagonally to row 4 and back costs more: two diagonal steps beside the wall would cut its corner.
     assert length[0, 4] == pytest.approx(4 + 4 + 4 - 2 * (2 - np.sqrt(2)))
@@ -249,7 +248,7 @@ def test_the_frontier_baseline_walks_over_known_floor_only_and_towards_a_frontie
         known = known_map(view, stood[: number + 1])
         ahead = view.position - SETTINGS.forward_m * np.array([np.sin(view.yaw), 0.0, np.cos(view.yaw)])
         assert walkable(known.state != UNKNOWN, *known.at(view.position), *known.at(ahead))
-        length, _ = shortest_walks(known.navigable, known.at(view.position).astype(int))
+        length, _ = shortest_walks(known.navigable, *known.at(view.position).astype(int))
         frontiers = find_frontiers(known, np.zeros_like(known.state))
         assert any(np.isfinite(length[tuple(frontier.cells.T)]).any() for frontier in frontiers)
         walks += 1

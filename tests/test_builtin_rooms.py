@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, uniform_filter, zoom
 
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics, camera_to_world
-from avp_habitat.scenes.builtin.floorplan import largest_part
+from avp_habitat.scenes.builtin.furnish import largest_part
 from avp_habitat.scenes.builtin.kit import FLAT_M, Kit
 from avp_habitat.scenes.builtin.noise import Random, fractal
 from avp_habitat.scenes.builtin.room import generate_room, plan_room
@@ -371,7 +371,7 @@ def test_the_largest_part_of_a_mask_is_found():
     assert largest_part(mask).tolist() == [[0, 0, 1, 1], [0, 0, 0, 1], [0, 0, 1, 1]]
 
 
-def test_dice_shuffle_without_loss_and_depend_on_seed_and_stream():
+def test_random_numbers_shuffle_without_loss_and_depend_on_seed_and_stream():
     assert sorted(Random(1).shuffled(list(range(20)))) == list(range(20))
     streams = [tuple(Random(seed, stream).array(4)) for seed in (0, 1) for stream in (0, 1)]
     assert len(set(streams)) == 4

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from avp_habitat import poses
 from avp_habitat.poses import Intrinsics
-from avp_habitat.sight.coverage import candidates, visible_in_depth
+from avp_habitat.sight.rules import candidates, visible_in_depth
 from avp_habitat.task.cast import cells_passed_over
 
 SIMULATOR = Corridor()

@@ -11,6 +11,7 @@ import zlib
 
 import numpy as np
 import pytest
+import rerun as rr
 from corridor import Corridor
 from mlflow import MlflowClient
 from PIL import Image
@@ -208,11 +209,11 @@ def seen_json(folder):
 
 
 def importer(folder):
-    from avp_sb3.rerun.destination import Destination
-    from avp_sb3.rerun.recording import recording_bytes
+    from avp_sb3.rerun.rollout import log_rollouts
 
-    destination = Destination(application_id="a", recording_id=None, prefix="", times={}, own=True)
-    assert recording_bytes([read_rollout(folder)], destination)
+    recording = rr.RecordingStream("avp")
+    log_rollouts(recording, [read_rollout(folder)])
+    assert recording.binary_stream().read()
 
 
 def logged(client, folder):

@@ -22,9 +22,7 @@ LIGHT = (
     "poses",
     "ranges",
     "rollout.format",
-    "rollout.png",
-    "sight.coverage",
-    "sight.visibility",
+    "rollout.images",
     "task.rewards",
     "task.trajectory",
 )

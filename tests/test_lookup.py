@@ -11,9 +11,11 @@ from corridor import Corridor
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics, camera_to_world
 from avp_habitat.sight import panorama
-from avp_habitat.sight.coverage import candidates
-from avp_habitat.sight.rows import Lattice, TileFiles, cache_folder
-from avp_habitat.sight.tables import SceneTables, ViewKey, scene_tables
+from avp_habitat.sight.bits import pack, unpack
+from avp_habitat.sight.lattice import Lattice, TileFiles, cache_folder
+from avp_habitat.sight.newly_seen import new_cells, new_surface
+from avp_habitat.sight.rules import camera_numbers, candidates, view_quality
+from avp_habitat.sight.tables import make_scene_tables, scene_tables
 from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.task.cast import CastSensor
 from avp_habitat.task.settings import TaskSettings
@@ -32,8 +34,7 @@ def room():
 @pytest.fixture
 def tables(room, tmp_path, monkeypatch):
     monkeypatch.setenv("AVP_CACHE", str(tmp_path))
-    key = ViewKey(1.5, CAMERA, 60.0, 10.0, 0.1)
-    return SceneTables(room, key)
+    return make_scene_tables(room, SETTINGS)
 
 
 def views_at(area, count, seed):
@@ -69,7 +70,7 @@ def test_cells_that_are_looked_up_are_those_that_rays_reach(room):
     by_ray, looked_up = np.zeros((2, 30, cells), dtype=np.int16)
     everyone, steps = np.arange(30), np.full(30, 7)
     from_rays = cast.capture(views, by_ray, everyone, steps)
-    from_tables = task._rooms[0].senses.capture(views, looked_up, everyone, steps)
+    from_tables = task._rooms[0].sensor.capture(views, looked_up, everyone, steps)
     assert by_ray.sum() > 0
     assert np.count_nonzero(by_ray != looked_up) <= 0.005 * np.count_nonzero(by_ray)
     np.testing.assert_array_equal(from_tables.new_cells, np.count_nonzero(looked_up, axis=1))
@@ -85,19 +86,14 @@ def test_a_table_holds_what_rays_from_its_place_reach(room, tables):
     cells = len(room.area.centres)
     pairs = np.argwhere(np.ones((4, cells), dtype=bool))
     reached = room.reached(eye, room.area.centres, pairs, tolerance_m=0.1).reshape(4, cells)
-    bits = np.unpackbits(tables.visible[slots[0]].view(np.uint8), axis=1, bitorder="little")[:, :cells]
-    np.testing.assert_array_equal(bits.astype(bool), reached)
+    np.testing.assert_array_equal(unpack(tables.columns["visible"][slots[0]], cells), reached)
 
 
 def test_panoramas_give_the_statistics_of_depth_images(room):
     rng = np.random.default_rng(1)
     eye = room.area.random_points(rng, 20) + [0, 1.5, 0]
     pitches = tuple(np.radians([-40.0, -10.0, 0.0, 20.0]))
-    around = panorama.directions().reshape(-1, 3)
-    distance = room.distance(np.repeat(eye, len(around), axis=0), np.tile(around, (20, 1)))
-    found = panorama.view_statistics(
-        distance.reshape(20, panorama.AZIMUTHS, panorama.ELEVATIONS), panorama.view_samples(CAMERA, pitches), 10.0
-    )
+    found = panorama.view_statistics(panorama.look_around(room, eye), panorama.view_samples(CAMERA, pitches), 10.0)
     yaw, pitch = rng.integers(panorama.YAWS, size=20), rng.integers(len(pitches), size=20)
     pose = camera_to_world(eye, yaw=2 * np.pi / panorama.YAWS * yaw, pitch=np.array(pitches)[pitch])
     truth = depth_statistics(room.render(pose, CAMERA, rgb=False).depth, 10.0)
@@ -130,10 +126,14 @@ def test_tables_are_read_from_disk_and_not_made_again(room, tables):
     class NoRays:
         name, area, scene_digest = room.name, room.area, room.scene_digest
 
-    again = SceneTables(NoRays(), tables.key)
+    again = make_scene_tables(NoRays(), SETTINGS)
     again.around(feet)
-    np.testing.assert_array_equal(again.statistics, tables.statistics)
-    np.testing.assert_array_equal(again.visible, tables.visible)
+    assert_same_columns(again, tables)
+
+
+def assert_same_columns(found, expected):
+    for name in ("visible", "statistics"):
+        np.testing.assert_array_equal(found.columns[name], expected.columns[name])
 
 
 def same_layout_other_content(content):
@@ -165,26 +165,25 @@ def test_a_damaged_tile_is_made_anew(room, tables, tmp_path, damage):
     damaged = DAMAGES[damage](sound)
     assert damaged != sound
     file.write_bytes(damaged)
-    again = SceneTables(room, tables.key)
+    again = make_scene_tables(room, SETTINGS)
     again.around(feet)
-    np.testing.assert_array_equal(again.visible, tables.visible)
-    np.testing.assert_array_equal(again.statistics, tables.statistics)
+    assert_same_columns(again, tables)
     assert file.read_bytes() == sound
 
 
 def test_a_tile_of_other_settings_in_its_place_is_made_anew(room, tables, tmp_path):
     """Points, types and shapes are the same: only the digest tells the tile of a camera 0.5 m lower."""
-    low = SceneTables(room, replace(tables.key, sensor_height_m=1.0))
+    low = make_scene_tables(room, replace(SETTINGS, sensor_height_m=1.0))
     for each in (low, tables):
         each.around(room.area.centres[:1])
     files = sorted(tmp_path.rglob("*.npz"), key=lambda path: path.stat().st_mtime_ns)
     assert len(files) == 2
     assert files[0].name == files[1].name
     files[1].write_bytes(files[0].read_bytes())
-    again = SceneTables(room, tables.key)
+    again = make_scene_tables(room, SETTINGS)
     again.around(room.area.centres[:1])
-    assert (low.visible != tables.visible).any()
-    np.testing.assert_array_equal(again.visible, tables.visible)
+    assert (low.columns["visible"] != tables.columns["visible"]).any()
+    assert_same_columns(again, tables)
 
 
 def test_a_disk_that_cannot_be_written_costs_a_warning(tmp_path, monkeypatch):
@@ -233,22 +232,25 @@ def test_any_pitch_limit_is_looked_up(room, limit):
         np.testing.assert_allclose(found, expected, atol=0.02)
 
 
-def test_the_frustum_of_the_tables_is_that_of_the_definition(room):
-    # A narrow, off-centre camera: swapped axes or a forgotten principal point would show.
-    camera = Intrinsics(40, 90, 50.0, 60.0, 12.0, 70.0)
-    views = views_at(room.area, 10, seed=5)
-    from avp_habitat.sight.kernels import _in_view
-
-    centres = room.area.centres
-    expected = candidates(views.camera_to_world, camera, centres, np.ones((10, len(centres)), bool), max_range_m=4.0)
-    numbers = (40.0, 90.0, 50.0, 60.0, 12.0, 70.0)
-    found = [
-        (view, cell)
-        for view in range(10)
-        for cell in range(len(centres))
-        if _in_view(views.camera_to_world[view], centres[cell], numbers, 4.0)
-    ]
-    assert found == [tuple(pair) for pair in expected.tolist()]
+def test_what_the_places_differ_on_is_returned_and_what_all_see_is_entered(room):
+    camera, count = Intrinsics(40, 90, 50.0, 60.0, 12.0, 70.0), 60
+    views, centres = views_at(room.area, count, seed=5), room.area.centres
+    pose, normals = views.camera_to_world, np.tile([0.0, 1.0, 0.0], (len(centres), 1))
+    inside = candidates(pose, camera, centres, np.ones((count, len(centres)), bool), max_range_m=4.0)
+    assert len(inside) > 600  # more than there is room for at first
+    quality = view_quality(pose[:, :3, 3], centres, normals)[tuple(inside.T)].astype(np.float32)
+    members = np.zeros((2, len(centres)), bool)
+    members[1] = True
+    numbers, rows, steps = camera_numbers(camera), np.arange(count), np.full(count, 3)
+    for slots, sure in ((np.ones((count, 4), np.int32), True), (np.tile(np.int32([0, 1, 0, 0]), (count, 1)), False)):
+        seen = np.zeros((count, len(centres)), np.int16)
+        found, pairs = new_cells(pack(members), slots, pose, centres, numbers, 4.0, rows, steps, seen)
+        assert (found.sum(), len(pairs)) == ((len(inside), 0) if sure else (0, len(inside)))
+        np.testing.assert_array_equal(np.argwhere(seen == 3) if sure else pairs, inside)
+        best = np.zeros((count, len(centres)), np.float32)
+        grown, _, values = new_surface(pack(members), slots, pose, centres, normals, numbers, 4.0, rows, best)
+        np.testing.assert_allclose(best[tuple(inside.T)] if sure else values, quality, rtol=1e-6)
+        assert grown.sum() == pytest.approx(quality.sum() if sure else 0, rel=1e-4)
 
 
 def test_tables_live_as_long_as_their_simulator_and_no_longer():

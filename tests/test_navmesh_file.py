@@ -156,8 +156,8 @@ def test_the_ray_caster_walks_where_the_file_says_on_the_scenes_own_floor(tmp_pa
     np.testing.assert_allclose(given_one.area.centres[:, 1], own.area.floor_height(given_one.area.centres), atol=0.03)
     assert make_simulator("raycast", "builtin:0") is not given_one
     # Tables on disk are of the cells that there are.
-    files = [scene_tables(each, TaskSettings(lookup=True))._rows._files for each in (own, given_one)]
-    assert files[0]._folder != files[1]._folder
+    own_tables, other_tables = (scene_tables(each, TaskSettings(lookup=True)) for each in (own, given_one))
+    assert own_tables.name != other_tables.name
 
 
 def test_a_file_of_another_scene_is_refused(tmp_path):

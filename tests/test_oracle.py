@@ -7,12 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from avp_habitat.errors import UsageError
-from avp_habitat.policies.oracle.lattice import lattice_of, make_lattice, pack, start_state, unpack, views_from
+from avp_habitat.policies.oracle.places import make_places, scene_places, views_from
 from avp_habitat.policies.oracle.policy import OraclePolicy, make_plan, planned_coverage
-from avp_habitat.policies.oracle.search import BeamSettings, beam_search
-from avp_habitat.policies.oracle.tour import covering_tour, greedy_cover, lattice_poses
+from avp_habitat.policies.oracle.search import BeamSettings, beam_search, start_state
+from avp_habitat.policies.oracle.tour import all_poses, covering_tour, greedy_cover
 from avp_habitat.policies.reactive import RandomPolicy
-from avp_habitat.sight.coverage import candidates
+from avp_habitat.sight.bits import pack, unpack
+from avp_habitat.sight.rules import candidates
 from avp_habitat.task.agent_view import agent_views
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.motion import act, sensor_poses
@@ -51,9 +52,9 @@ def start_of(view):
 @pytest.mark.parametrize("scene", ["corridor", "room"])
 def test_planned_coverage_is_what_the_environment_measures(scene, request):
     env = AVPEnv(simulator=request.getfixturevalue(scene), **SMALL)
-    policy = OraclePolicy(lambda: agent_views(env), NARROW)
+    policy = OraclePolicy(lambda: agent_views(env), beam=NARROW)
     measured, actions = play(env, policy, seed=5)
-    np.testing.assert_allclose(measured, policy.plan(0).coverage, atol=0.01)
+    np.testing.assert_allclose(measured, policy.planner(0).plan.coverage, atol=0.01)
     assert STOP not in actions
     assert len(actions) == 80
 
@@ -61,12 +62,12 @@ def test_planned_coverage_is_what_the_environment_measures(scene, request):
 def test_the_tables_foresee_the_coverage_of_a_plan(room):
     env = AVPEnv(simulator=room, **SMALL)
     env.reset(seed=8)
-    view, lattice = env.agent_view, lattice_of(room, env.settings)
-    tour = covering_tour(room.area, lattice, env.settings, start_of(view), 80)
+    view, places = env.agent_view, scene_places(room, env.settings)
+    tour = covering_tour(places, env.settings, start_of(view), 80)
     state, foreseen = (view.position[None], np.array([view.yaw]), np.array([view.pitch])), set()
     for action in tour:
         state = act(room.area, env.settings, np.array([action]), *state)
-        foreseen |= set(np.flatnonzero(unpack(views_from(lattice, env.settings, *state), len(view.observed))))
+        foreseen |= set(np.flatnonzero(unpack(views_from(places, env.settings, *state), len(view.observed))))
     true = planned_coverage(view, tour)[-1]
     assert len(foreseen) / len(view.observed) == pytest.approx(true, abs=0.01)
 
@@ -83,7 +84,7 @@ def test_the_oracle_is_at_least_as_good_as_its_covering_tour(room):
     env = AVPEnv(simulator=room, **SMALL)
     env.reset(seed=2)
     view = env.agent_view
-    tour = covering_tour(room.area, lattice_of(room, env.settings), env.settings, start_of(view), 80)
+    tour = covering_tour(scene_places(room, env.settings), env.settings, start_of(view), 80)
     alone = planned_coverage(view, tour)
     assert make_plan(view).coverage.mean() >= alone.mean()
     assert alone[-1] > 0.7
@@ -92,19 +93,19 @@ def test_the_oracle_is_at_least_as_good_as_its_covering_tour(room):
 def test_beam_search_finds_the_best_of_all_short_sequences(corridor):
     env = AVPEnv(simulator=corridor, **SMALL, budget=4, turn_deg=40.0, tilt_deg=20.0, forward_m=0.6)
     env.reset(seed=0)
-    view, lattice = env.agent_view, lattice_of(corridor, env.settings)
-    found = beam_search(corridor.area, lattice, env.settings, start_of(view), 4, BeamSettings())
+    view, places = env.agent_view, scene_places(corridor, env.settings)
+    found = beam_search(places, env.settings, start_of(view), 4, BeamSettings())
     every = [np.array(actions) for actions in itertools.product(range(5), repeat=4)]
     values = [planned_coverage(view, actions).mean() for actions in every]
     assert planned_coverage(view, found).mean() >= max(values) - 0.005
     assert np.quantile(values, 0.99) < max(values) - 0.005
 
 
-def test_visible_sets_of_the_lattice_follow_the_rule_of_the_task(corridor):
+def test_visible_sets_of_the_places_follow_the_rule_of_the_task(corridor):
     task = TaskSettings(width=32, height=20)
-    lattice = lattice_of(corridor, task)
-    poses = lattice_poses(lattice, task, yaw=0.123)
-    position = lattice.places[poses.place]
+    places = scene_places(corridor, task)
+    poses = all_poses(places, task, yaw=0.123)
+    position = places.position[poses.place]
     sensor = sensor_poses(task, position, poses.yaw, poses.pitch)
     points = corridor.area.centres
     everything = np.ones((len(sensor), len(points)), dtype=bool)
@@ -117,28 +118,28 @@ def test_visible_sets_of_the_lattice_follow_the_rule_of_the_task(corridor):
     np.testing.assert_array_equal(unpack(poses.sets, len(points)), expected)
 
 
-def test_a_range_limits_what_the_lattice_sees(corridor):
+def test_a_range_limits_what_the_places_see(corridor):
     task = TaskSettings(max_range_m=2.5)
-    lattice = make_lattice(corridor, task)
-    far = np.linalg.norm((lattice.points[None] - lattice.places[:, None])[..., [0, 2]], axis=-1) > 2.0001
-    sees = unpack(lattice.sees, len(lattice.points))
+    places = make_places(corridor, task)
+    far = np.linalg.norm((places.points[None] - places.position[:, None])[..., [0, 2]], axis=-1) > 2.0001
+    sees = unpack(places.sees, len(places.points))
     assert not (sees & far).any()
     assert sees.any(axis=1).all()
 
 
 def test_reach_counts_the_steps_around_the_wall(corridor):
-    lattice = lattice_of(corridor, TaskSettings())
-    at = lattice.place_of(np.array([[2.55, 0.0, 0.25]]))[0]
-    cell = lattice.place_of(np.array([[3.45, 0.0, 0.25]]))[0]
-    behind_wall, in_sight = lattice.reach[at, cell], lattice.reach[at, at - 10]
+    places = scene_places(corridor, TaskSettings())
+    at = places.nearest(np.array([[2.55, 0.0, 0.25]]))[0]
+    cell = places.nearest(np.array([[3.45, 0.0, 0.25]]))[0]
+    behind_wall, in_sight = places.reach[at, cell], places.reach[at, at - 10]
     assert in_sight <= 2 * 1.0 / 0.25 + 1
     # The way to a view past the wall's end at z = 1.8 m is at least 1.2 m long.
     assert 2 * 1.2 / 0.25 <= behind_wall <= 2 * 3.0 / 0.25
 
 
-def test_few_table_entries_give_a_coarser_lattice_of_the_same_scene(corridor):
+def test_few_table_entries_give_a_coarser_grid_of_places_in_the_same_scene(corridor):
     task = TaskSettings()
-    fine, coarse = make_lattice(corridor, task), make_lattice(corridor, task, entries=200_000)
+    fine, coarse = make_places(corridor, task), make_places(corridor, task, entries=200_000)
     assert len(coarse.places) * len(coarse.points) <= 200_000 < len(fine.places) * len(fine.points)
     assert set(map(tuple, coarse.places)) <= set(map(tuple, fine.places))
     assert unpack(coarse.wanted[None], len(coarse.points)).all()
@@ -148,7 +149,7 @@ def test_few_table_entries_give_a_coarser_lattice_of_the_same_scene(corridor):
 @settings(max_examples=60, deadline=None)
 def test_greedy_cover_follows_the_definition_and_keeps_its_guarantee(rows, limit):
     members = np.array(rows)
-    chosen = greedy_cover(pack(members), pack(np.ones((1, 9), dtype=bool))[0], limit)
+    chosen = greedy_cover(pack(members), pack(np.ones((1, 9), dtype=bool))[0])[:limit]
     covered, expected = np.zeros(9, dtype=bool), []
     for _ in range(limit):
         gain = [(row & ~covered).sum() for row in members]
@@ -176,12 +177,12 @@ def test_an_episode_taken_over_in_the_middle_is_planned_from_there(corridor):
     observation, _ = env.reset(seed=4)
     for action in (0, 1, 1):
         observation, *_ = env.step(action)
-    policy = OraclePolicy(lambda: agent_views(env), NARROW)
+    policy = OraclePolicy(lambda: agent_views(env), beam=NARROW)
     measured = []
     for _ in range(27):
         observation, _, _, _, info = env.step(int(policy.predict(observation)[0]))
         measured.append(info["coverage"])
-    np.testing.assert_allclose(measured, policy.plan(0).coverage, atol=0.01)
+    np.testing.assert_allclose(measured, policy.planner(0).plan.coverage, atol=0.01)
 
 
 def test_every_agent_of_a_vector_environment_follows_its_own_plan(corridor):
@@ -193,7 +194,7 @@ def test_every_agent_of_a_vector_environment_follows_its_own_plan(corridor):
     for step in range(12):
         actions, _ = policy.predict(observations)
         assert actions.shape == (2,)
-        plans = [policy.plan(agent).coverage for agent in range(2)]
+        plans = [policy.planner(agent).plan.coverage for agent in range(2)]
         observations, _, _, infos = vec_env.step(actions)
         for info, plan in zip(infos, plans, strict=True):
             assert info["coverage"] == pytest.approx(plan[step % 6], abs=0.01)

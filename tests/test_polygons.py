@@ -6,7 +6,7 @@ from test_scene_placing import box
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.loader import load_scene
-from avp_habitat.scenes.polygons import triangulate
+from avp_habitat.scenes.mesh import triangulate
 from avp_habitat.simulators.registry import make_simulator
 
 WITH_DOOR = [(0, 0), (2, 0), (2, 2), (3, 2), (3, 0), (5, 0), (5, 2.6), (0, 2.6)]

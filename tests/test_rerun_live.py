@@ -1,4 +1,3 @@
-import importlib.util
 import socket
 import subprocess
 import time
@@ -8,16 +7,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
-from rrd import rows, verify
+from rrd import PROGRAM, rows, verify
 from stable_baselines3.common.callbacks import BaseCallback
 from tracking import ppo
 
 from avp_habitat.errors import UsageError
 from avp_sb3 import RerunCallback
 from avp_sb3.callbacks.rerun import RecordingError
-
-PROGRAM = Path(importlib.util.find_spec("rerun_cli").origin).parent / "rerun"
-"""The script on the path would leave it running when it is stopped."""
 
 
 @contextmanager

@@ -1,5 +1,4 @@
 import csv
-import gc
 import io
 import json
 import re
@@ -17,9 +16,8 @@ from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout.format import read_rollout
 from avp_habitat.rollout.writing import RolloutWriter
-from avp_sb3.rerun.destination import Destination, DestinationRecording
-from avp_sb3.rerun.recording import main, write_rollout_recording
-from avp_sb3.rerun.rollout import read_contents
+from avp_sb3.rerun.__main__ import main
+from avp_sb3.rerun.rollout import read_contents, write_rollout_recording
 
 
 @pytest.fixture(scope="module")
@@ -244,13 +242,3 @@ def test_the_command_names_what_is_no_rollout(tmp_path, capsys):
     assert run(main, [str(tmp_path / "none"), "--out", str(tmp_path / "a.rrd")]) == 1
     assert re.search(r"error: .*none: expected a rollout folder", capsys.readouterr().err)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("times", [{"t": "noon"}, {"t": None}, {3: 1}])
-@pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
-def test_a_recording_that_cannot_be_made_says_only_why(times):
-    with pytest.raises((TypeError, ValueError)):
-        DestinationRecording(Destination(times=times))
-    with pytest.raises(TypeError):
-        DestinationRecording(Destination(application_id=None))
-    gc.collect()

@@ -13,7 +13,7 @@ from avp_habitat.rollout.capture import capture_step, publish_rollout
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.rewards import (
-    REWARD_NAMES,
+    REWARDS,
     RewardConstants,
     StepFacts,
     find_reward,
@@ -24,8 +24,7 @@ from avp_habitat.task.rewards import (
 from avp_habitat.task.settings import TaskSettings
 from avp_sb3 import AVPVecEnv
 from avp_sb3.callbacks.metrics import EpisodeWindow
-from avp_sb3.rerun.recording import write_rollout_recording
-from avp_sb3.rerun.rollout import Steps
+from avp_sb3.rerun.rollout import read_steps, write_rollout_recording
 
 # All different and none a special value, so that a swapped or forgotten constant changes a sum.
 CONSTANTS = RewardConstants(
@@ -86,7 +85,7 @@ def by_hand(name, facts, i):
     return new | {"spread": spread, "step": -c.step, "collision": collision, "redundancy": redundancy, "stop": stop}
 
 
-@pytest.mark.parametrize("name", REWARD_NAMES)
+@pytest.mark.parametrize("name", REWARDS)
 @given(seed=st.integers(0, 100_000))
 def test_every_part_equals_the_formula_by_hand(name, seed):
     facts = random_facts(seed)
@@ -97,7 +96,7 @@ def test_every_part_equals_the_formula_by_hand(name, seed):
 
 
 def test_only_the_proposed_and_the_surface_reward_have_a_stop():
-    assert [name for name in REWARD_NAMES if has_stop(find_reward(name))] == ["proposed", "surface"]
+    assert [name for name in REWARDS if has_stop(find_reward(name))] == ["proposed", "surface"]
 
 
 def test_stopping_needs_the_choice_and_the_coverage():
@@ -170,7 +169,7 @@ def test_a_rollout_holds_the_parts_by_their_names_also_those_of_later_steps_only
             _, reward, _, _, info = env.step(action)
             capture_step(env, writer, action, reward, info)
         publish_rollout(env, writer, info, policy={"name": "a list"}, seed=0, heldout=0)
-    plots = Steps(tmp_path / "r" / "steps.csv", frames=12).plots()
+    plots, _ = read_steps(tmp_path / "r" / "steps.csv", frames=12)
     parts = {name.removeprefix("reward/"): values for name, values in plots.items() if name.startswith("reward/")}
     total = parts.pop("sum")
     assert set(parts) == {"look, around", "time", "blocked/twice"}

@@ -12,7 +12,7 @@ from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout import images
 from avp_habitat.rollout.capture import capture_step, publish_rollout
 from avp_habitat.rollout.format import read_rollout
-from avp_habitat.rollout.png import check_png_contents
+from avp_habitat.rollout.images import check_png_contents
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.task.env import AVPEnv
 
@@ -330,7 +330,6 @@ DAMAGES = {
 
 
 def test_a_pose_written_with_few_digits_is_still_rigid(rollout):
-    """Between the quick test for thousands of poses and the tolerance, the exact test decides."""
     path = rollout / "poses/frame_00001.txt"
     np.savetxt(path, np.loadtxt(path).round(4), fmt="%.4f")
     written = np.loadtxt(path)

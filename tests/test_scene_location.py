@@ -18,7 +18,7 @@ from avp_habitat.scenes.builtin.room import generate_room
 from avp_habitat.scenes.export import export_glb
 from avp_habitat.scenes.loader import Scene, identify, load_scene
 from avp_habitat.scenes.location import locate
-from avp_habitat.scenes.mesh import TexturedMesh, say_once
+from avp_habitat.scenes.mesh import TexturedMesh, warn_once
 from avp_habitat.scenes.stage_config import Y_UP, Z_UP
 from avp_habitat.simulators.raycast import RaycastSimulator
 
@@ -527,5 +527,5 @@ def test_whatever_a_config_holds_brings_a_scene_or_an_error_of_ours(tmp_path_fac
 
 def test_what_is_said_of_a_scene_is_said_once(caplog):
     for text in ("first", "second", "first"):
-        say_once("room.glb", text)
+        warn_once("room.glb", text)
     assert caplog.messages == ["room.glb: first", "room.glb: second"]

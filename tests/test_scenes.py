@@ -449,7 +449,7 @@ def test_an_export_does_not_overwrite(tmp_path, capsys):
 
 def test_an_export_into_a_missing_folder_is_one_line(tmp_path, capsys):
     assert run(export.main, [quad().write(tmp_path), str(tmp_path / "no" / "out.glb")]) == 1
-    assert "cannot be written: No such file or directory" in capsys.readouterr().err
+    assert "cannot be written: there is no folder" in capsys.readouterr().err
 
 
 def test_the_export_command_writes_the_scene(tmp_path, capsys):

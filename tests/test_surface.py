@@ -4,10 +4,12 @@ from corridor import ROOM, WALL, Corridor
 
 from avp_habitat import poses
 from avp_habitat.errors import UsageError
+from avp_habitat.sight.bits import unpack
+from avp_habitat.sight.rules import view_quality
 from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.surface.map import CELL_M, FULL, GROUPS, SIDE, SurfaceMapper
-from avp_habitat.surface.memory import SurfaceTables, raise_quality, surface_tables
-from avp_habitat.surface.points import EDGE_M, SceneSurface, scene_surface, view_quality
+from avp_habitat.surface.memory import make_surface_tables, raise_quality, surface_tables
+from avp_habitat.surface.points import EDGE_M, SceneSurface, scene_surface
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.settings import TaskSettings
 from avp_habitat.task.task import ViewpointTask
@@ -71,7 +73,7 @@ def test_the_points_are_the_same_every_time():
     ],
 )
 def test_a_surface_is_seen_well_from_near_and_straight_on(eye, quality):
-    assert view_quality(np.array(eye), np.zeros(3), np.array([0.0, 0, 1])) == pytest.approx(quality)
+    assert view_quality(np.array([eye]), np.zeros((1, 3)), np.array([[0.0, 0, 1]])) == pytest.approx(quality)
 
 
 def seen_by_hand(settings, simulator, surface, pose):
@@ -145,35 +147,23 @@ def test_tables_and_rays_agree_over_whole_episodes(room, other):
 def test_a_surface_table_holds_what_rays_from_its_place_reach(room, tmp_path, monkeypatch):
     monkeypatch.setenv("AVP_CACHE", str(tmp_path))
     settings = TaskSettings(reward="surface", lookup=True)
-    tables, points = SurfaceTables(room, settings), scene_surface(room, settings).points
-    slots = tables.around(room.area.centres[[100]])
-    eye = tables._rows._lattice.feet(tables._rows._lattice.around(room.area.centres[[100]])[0][0]) + [0, 1.5, 0]
+    tables, points = make_surface_tables(room, settings), scene_surface(room, settings).points
+    feet = room.area.centres[[100]]
+    slots, _ = tables.around(feet)
+    eye = tables.lattice.feet(tables.lattice.around(feet)[0][0]) + [0, 1.5, 0]
     pairs = np.argwhere(np.ones((4, len(points)), dtype=bool))
     reached = room.reached(eye, points, pairs, tolerance_m=0.1).reshape(4, -1)
-    bits = np.unpackbits(tables.visible[slots[0]].view(np.uint8), axis=1, bitorder="little")[:, : len(points)]
-    np.testing.assert_array_equal(bits.astype(bool), reached)
-    again = SurfaceTables(room, settings)
-    again._rows._compute = None
-    again.around(room.area.centres[[100]])
-    np.testing.assert_array_equal(again.visible, tables.visible)
+    np.testing.assert_array_equal(unpack(tables.columns["visible"][slots[0]], len(points)), reached)
+    again = make_surface_tables(room, settings)
+    again._compute = None
+    again.around(feet)
+    np.testing.assert_array_equal(again.columns["visible"], tables.columns["visible"])
 
 
 def test_tasks_on_one_simulator_share_tables_and_a_lower_camera_has_its_own(room):
     settings = TaskSettings(reward="surface", lookup=True)
     assert surface_tables(room, settings) is surface_tables(room, TaskSettings(observation="surface_map", width=20))
     assert surface_tables(room, settings) is not surface_tables(room, TaskSettings(sensor_height_m=1.2))
-
-
-def test_more_doubts_than_there_is_room_for_are_all_decided(room):
-    settings = TaskSettings(reward="surface", lookup=True)
-    found = []
-    for space in (1, 100_000):
-        task = ViewpointTask(room, settings, agents=3)
-        senses = task._rooms[0].surface._senses
-        senses._doubtful, senses._doubtful_q = np.empty((space, 2), np.int64), np.empty(space, np.float32)
-        task.reset(range(3), room.area.centres[[10, 200, 500]], np.zeros(3))
-        found.append([task.step(np.full(3, action)).facts.new_surface for action in (1, 0, 2, 4)])
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-5)
 
 
 def test_growth_is_entered_and_summed_by_agent():

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from avp_habitat.errors import UsageError
-from avp_habitat.policies.oracle.lattice import SPACING_M, surface_points
+from avp_habitat.policies.oracle.places import SURFACE_SPACING_M, surface_points
 from avp_habitat.policies.oracle.policy import OraclePolicy, SurveyPolicy
 from avp_habitat.policies.oracle.search import BeamSettings
 from avp_habitat.policies.reactive import RandomPolicy
-from avp_habitat.sight.coverage import candidates
+from avp_habitat.sight.rules import candidates
 from avp_habitat.task.agent_view import agent_views
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.motion import sensor_poses
@@ -37,8 +37,8 @@ def share_of_surfaces_seen(env, policy):
 
 
 def test_the_survey_sees_more_surfaces_than_the_oracle_and_more_floor_than_chance(env):
-    survey, its_floor = share_of_surfaces_seen(env, SurveyPolicy(lambda: agent_views(env), NARROW))
-    oracle, _ = share_of_surfaces_seen(env, OraclePolicy(lambda: agent_views(env), NARROW))
+    survey, its_floor = share_of_surfaces_seen(env, SurveyPolicy(lambda: agent_views(env), beam=NARROW))
+    oracle, _ = share_of_surfaces_seen(env, OraclePolicy(lambda: agent_views(env), beam=NARROW))
     random, random_floor = share_of_surfaces_seen(env, RandomPolicy.for_env(env, seed=0))
     assert survey > max(oracle, random) + 0.1
     assert its_floor > random_floor + 0.1
@@ -46,7 +46,7 @@ def test_the_survey_sees_more_surfaces_than_the_oracle_and_more_floor_than_chanc
 
 def test_surface_points_lie_on_surfaces_off_the_floor_and_apart(env):
     points = surface_points(env.simulator, env.settings)
-    cubes = np.floor(points / SPACING_M).astype(int)
+    cubes = np.floor(points / SURFACE_SPACING_M).astype(int)
     assert len(np.unique(cubes, axis=0)) == len(points) > 100
     assert np.abs(points[:, 1] - env.simulator.area.centres[0, 1]).min() > 0.04
     origin = env.simulator.area.centres[:1] + [0.0, 1.5, 0.0]

@@ -7,7 +7,7 @@ import pytest
 
 from avp_habitat import collect, command
 from avp_habitat.errors import UsageError
-from avp_habitat.metrics import FIGURES, Figure, figures, find_metrics, measured, metric
+from avp_habitat.metrics import FIGURES, Figure, figure_of, figures, find_metrics, measured, metric
 from avp_habitat.rollout.format import read_rollout
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.settings import TaskSettings
@@ -89,5 +89,7 @@ def test_a_metric_that_gives_no_number_is_refused():
 def test_figures_are_the_suites_and_the_chosen_ones():
     shown = figures((turned_deg,))
     assert [*shown][: len(FIGURES)] == [*FIGURES]
+    assert shown["turned_deg"] == turned_deg.figure
+    assert figure_of("never_heard_of").heading == "never heard of"
     assert shown["turned_deg"].heading == "turned [°]"
     assert shown["turned_deg"].text(30.4, 2.6) == "30 ± 3"

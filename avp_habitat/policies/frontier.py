@@ -5,19 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.policies.planning import (
+from avp_habitat.policies.known_map import (
     FREE,
     OBSERVED,
     UNKNOWN,
     KnownMap,
-    PlanningPolicy,
     farthest_straight,
     route_to,
     shortest_walks,
     walkable,
 )
-from avp_habitat.policies.predicted_views import in_view, make_lens, should_look_down
-from avp_habitat.policies.reactive import Memory
+from avp_habitat.policies.planning import PlanningPolicy
+from avp_habitat.policies.predicted_views import Memory, in_view, make_lens, should_look_down
 from avp_habitat.poses import wrap_angle
 from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.settings import LOOK_DOWN, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT
@@ -26,6 +25,15 @@ LEAST_CELLS = 3
 """Smaller frontiers are ignored."""
 TRIES = 8
 """After this many views that should have observed a navigable cell, planners take it for hidden."""
+
+LOYALTY_MOVES = 3.0
+"""Another frontier must be this many moves nearer than the one approached before."""
+SAME_M = 0.5
+"""A frontier this close to the one approached before is what is left of it, metres."""
+LOOK_M = 1.0
+"""The agent does not turn to look at frontiers nearer than this: it sees them from elsewhere, metres."""
+
+Float = NDArray[np.float64]
 
 _EIGHT = np.ones((3, 3), dtype=np.bool_)
 
@@ -41,12 +49,7 @@ class Frontier:
 
 
 def find_frontiers(known: KnownMap, misses: NDArray[np.uint8]) -> list[Frontier]:
-    """The frontiers of a map, in the order of their first cells.
-
-    Args:
-        known: the map.
-        misses: `(rows, columns)` views that should have observed a cell which is still not observed.
-    """
+    """The frontiers of a map, in the order of their first cells; `misses` as `Memory.update` gives it."""
     from scipy.ndimage import binary_dilation, label
 
     unobserved = (known.state == FREE) & (misses < TRIES)
@@ -59,16 +62,6 @@ def find_frontiers(known: KnownMap, misses: NDArray[np.uint8]) -> list[Frontier]
             edge = unobserved & binary_dilation(group, _EIGHT)
             found.append(Frontier(np.argwhere(group), np.argwhere(edge)))
     return found
-
-
-LOYALTY_MOVES = 3.0
-"""Another frontier must be this many moves nearer than the one approached before."""
-SAME_M = 0.5
-"""A frontier this close to the one approached before is what is left of it, metres."""
-LOOK_M = 1.0
-"""The agent does not turn to look at frontiers nearer than this: it sees them from elsewhere, metres."""
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -114,9 +107,9 @@ class _Here:
         self._turn = np.radians(view.settings.turn_deg)
         self._forward = view.settings.forward_m / known.cell_m
         self._lens = make_lens(view.settings, known.cell_m)
-        self._half_view = np.arctan(self._lens.half_width)
+        self._half_view = np.radians(view.settings.hfov_deg) / 2
         self._navigable = known.navigable
-        self._length, self._before = shortest_walks(self._navigable, self._at.astype(np.int64))
+        self._length, self._before = shortest_walks(self._navigable, *map(int, self._at))
 
     def way_to(self, frontier: Frontier) -> _Way | None:
         lengths = self._length[tuple(frontier.cells.T)]

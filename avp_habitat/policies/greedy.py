@@ -7,11 +7,23 @@ from numpy.typing import NDArray
 
 from avp_habitat.compiled import njit
 from avp_habitat.policies.frontier import TRIES, Approach, find_frontiers
-from avp_habitat.policies.planning import FREE, OBSERVED, UNKNOWN, KnownMap, PlanningPolicy, walkable
-from avp_habitat.policies.predicted_views import Lens, clear_line, in_frame, make_lens, should_look_down
-from avp_habitat.policies.reactive import Memory
+from avp_habitat.policies.known_map import FREE, OBSERVED, UNKNOWN, KnownMap, walkable
+from avp_habitat.policies.planning import PlanningPolicy
+from avp_habitat.policies.predicted_views import Lens, Memory, clear_line, in_frame, make_lens, should_look_down
+from avp_habitat.sight.bits import ONE, size
 from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.settings import LOOK_DOWN, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT
+
+HORIZON = 12
+"""Moves that the search looks ahead."""
+COMMITTED = 3
+"""Moves that are made before the next search."""
+DISCOUNT = 0.95
+"""What a cell counts less for every move by which it is observed later."""
+BEYOND_M = 0.5
+"""Unknown floor within this distance of known floor is expected to be navigable, metres."""
+UNKNOWN_TRIES = 3
+"""After this many views that should have observed an unknown cell, it is taken for not navigable."""
 
 _MOST_PLACES = 600
 _MERGED = 2
@@ -76,7 +88,7 @@ def search(
     horizon: int,
     discount: float,
 ) -> tuple[list[int], float]:
-    """The moves (forward and turns) whose views should newly observe most.
+    """The moves (forward and turns) whose views should newly observe most; none when nothing is gained.
 
     The search walks through known navigable cells only. Of the ways that lead to the same place and heading with the
     fewest moves it keeps the one that gains most, so that its effort grows with the reachable poses, not with the
@@ -88,42 +100,16 @@ def search(
         start: where the agent is.
         lens: of the camera.
         horizon: greatest number of moves.
-        discount: the gain of a way is the sum over its views of the newly observed cells times
-            `discount ** (moves before the view's own)`.
+        discount: what a cell counts less for every move by which it is observed later.
 
     Returns:
-        The moves and their gain; no moves when nothing is gained.
+        The moves, and their gain: newly observed cells times `discount ** (moves before the view)`.
     """
     if not len(cells) or horizon < 1:
         return [], 0.0
     navigable = (state == FREE) | (state == OBSERVED)
     moves, gain = _search(_Scene(state, navigable, cells, start, lens, horizon), discount)
     return moves.tolist(), float(gain)
-
-
-def expected_views(
-    state: NDArray[np.uint8], cells: NDArray[np.int64], start: Start, lens: Lens, *, turns: int
-) -> NDArray[np.bool_]:
-    """`(2 turns + 1, k)` which cells the views after `turns` right turns … `turns` left turns should observe."""
-    views = np.zeros((2 * turns + 1, _words(cells)), np.uint64)
-    scene = _Scene(state, np.zeros(state.shape, np.bool_), cells, start, lens, turns)
-    _write_views(scene, start.row, start.column, views)
-    bits = np.unpackbits(views.astype("<u8").view(np.uint8), axis=1, bitorder="little")
-    return bits[:, : len(cells)].astype(np.bool_)
-
-
-@njit(cache=True)
-def _words(cells):
-    return (len(cells) + 63) // 64
-
-
-@njit(cache=True)
-def _ones(word):
-    """Number of bits set in a 64-bit word, summed in parallel over ever wider fields."""
-    word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
-    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
 @njit(cache=True)
@@ -137,7 +123,7 @@ def _write_views(scene, row, column, views):
         to_row, to_column = scene.cells[i, 0] + 0.5, scene.cells[i, 1] + 0.5
         if not clear_line(scene.state, row, column, to_row, to_column):
             continue
-        bit = np.uint64(1) << np.uint64(i % 64)
+        bit = ONE << np.uint64(i % 64)
         r, c = to_row - row, to_column - column
         for j in range(len(yaws)):
             if in_frame(lens, r, c, forward_rows[j], forward_columns[j], cos_pitch, sin_pitch):
@@ -146,7 +132,7 @@ def _write_views(scene, row, column, views):
 
 @njit(cache=True)
 def _empty_tree(scene):
-    headings, words = 2 * scene.horizon + 1, _words(scene.cells)
+    headings, words = 2 * scene.horizon + 1, (len(scene.cells) + 63) // 64
     nodes = _MOST_PLACES * headings
     rows, columns = scene.state.shape
     return _Tree(
@@ -196,7 +182,7 @@ def _offer(tree, node, to, move, factor):
     sight = tree.views[to // headings, to % headings]
     new = 0
     for w in range(len(sight)):
-        new += _ones(sight[w] & ~tree.seen[node, w])
+        new += size(sight[w] & ~tree.seen[node, w])
     gain = tree.gain[node] + factor * new
     first = tree.depth[to] < 0
     if first or gain > tree.gain[to]:
@@ -250,27 +236,11 @@ def _way(tree, node):
     return moves
 
 
-HORIZON = 12
-"""Moves that the search looks ahead."""
-COMMITTED = 3
-"""Moves that are made before the next search."""
-DISCOUNT = 0.95
-"""What a cell counts less for every move by which it is observed later."""
-BEYOND_M = 0.5
-"""Unknown floor within this distance of known floor is expected to be navigable, metres."""
-UNKNOWN_TRIES = 3
-"""After this many views that should have observed an unknown cell, it is taken for not navigable."""
-
-
 def expected_cells(known: KnownMap, misses: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Cells that are probably navigable and not observed yet: free ones, and unknown ones a little beyond them.
+    """`(rows, columns)` whether cells are probably navigable and not observed yet.
 
-    Args:
-        known: the map.
-        misses: `(rows, columns)` views that should have observed a cell which is still not observed.
-
-    Returns:
-        `(rows, columns)`; unknown cells that known obstacles cut off do not count.
+    These are free ones, and unknown ones a little beyond them that no known obstacle cuts off, less those that as many
+    views as `misses` allows, `(rows, columns)`, should have observed.
     """
     from scipy.ndimage import binary_dilation
 

@@ -4,7 +4,7 @@ import difflib
 import glob
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,10 @@ from avp_habitat.scenes.stage_config import (
     Y_UP,
     Z_UP,
     Layer,
-    Stage,
+    SceneLocation,
     expect_neutral,
     inside,
+    member,
     read_config,
     read_stage,
     replica_scene,
@@ -50,22 +51,6 @@ class Entry:
         return self.words.rpartition("/")[2] if scene is None else scene.name
 
 
-@dataclass(frozen=True)
-class FoundScene:
-    """A scene of a dataset."""
-
-    name: str
-    """Without folders."""
-    handle: str
-    """The whole one, as Habitat-Sim can be given it."""
-    stage: Stage
-    """What it shows besides objects."""
-    objects: int
-    """How many objects it has, articulated ones included."""
-    files: tuple[Path, ...]
-    """The configs that describe it, the dataset's not included."""
-
-
 class SceneDataset:
     """The scene instances and stages of one scene dataset config; their own files are read when they are asked for."""
 
@@ -76,15 +61,15 @@ class SceneDataset:
             SceneError: the config is damaged, or a search path leaves its folder.
         """
         self.path, self.folder = path, path.parent
-        config = read_config(path)
-        self._scenes = self._cell(config, "scene_instances")
-        self._stages = self._cell(config, "stages")
+        config, self._where = read_config(path), f"{path}: "
+        self._scenes = member(config, "scene_instances", {}, self._where)
+        self._stages = member(config, "stages", {}, self._where)
         self.scenes = list(self._listed(self._scenes, "scene_instances", SCENE_INSTANCE))
         self.stages = list(self._listed(self._stages, "stages", STAGE_CONFIG))
-        for index, cell in enumerate(self._member(self._stages, "stages", "configs", [])):
+        for index, cell in enumerate(member(self._stages, "configs", [], f"{self._where}stages.")):
             self._add_configured(cell, f"stages.configs[{index}]")
 
-    def scene(self, scene_id: str) -> FoundScene:
+    def scene(self, scene_id: str) -> SceneLocation:
         """The scene of an id.
 
         Args:
@@ -95,55 +80,41 @@ class SceneDataset:
             UsageError: the id is empty.
             SceneError: no scene or several have this id, or a config of the scene is damaged or not supported.
         """
+        every = [*self.scenes, *self.stages]
+        names = sorted({entry.name for entry in every})
+        examples = f"it has {len(names)} scenes" + (f": {_in_short(names)}" if names else "")
         if not scene_id:
-            raise UsageError(f"{self.path}: expected {self.path.name}:ID with the id of a scene; {self._examples()}")
+            raise UsageError(f"{self.path}: expected {self.path.name}:ID with the id of a scene; {examples}")
         for matches in _matches(scene_id, self.scenes, self.stages):
             if len(matches) > 1:
-                names = _in_short([entry.handle for entry in matches])
-                raise SceneError(f"{self.path}: {scene_id!r} stands for {len(matches)} scenes: {names}")
-            return self._instance(matches[0]) if matches[0] in self.scenes else self._bare(matches[0])
-        names = {word for entry in self._all() for word in (entry.name, entry.words)}
-        near = difflib.get_close_matches(scene_id, sorted(names), n=2, cutoff=0.5)
+                handles = _in_short([entry.handle for entry in matches])
+                raise SceneError(f"{self.path}: {scene_id!r} stands for {len(matches)} scenes: {handles}")
+            found = self._instance(matches[0]) if matches[0] in self.scenes else self._stage(matches[0])
+            entry = matches[0]
+            return replace(found, name=entry.name, scene_id=entry.handle)
+        near = difflib.get_close_matches(scene_id, sorted({*names, *(each.words for each in every)}), n=2, cutoff=0.5)
         hint = f"did you mean {' or '.join(near)}? " if near else ""
-        raise SceneError(f"{self.path}: has no scene {scene_id!r}; {hint}{self._examples()}")
-
-    def _all(self) -> list[Entry]:
-        return [*self.scenes, *self.stages]
-
-    def _examples(self) -> str:
-        names = sorted({entry.name for entry in self._all()})
-        return f"it has {len(names)} scenes" + (f": {_in_short(names)}" if names else "")
-
-    def _cell(self, config: dict[str, Any], key: str) -> dict[str, Any]:
-        return self._member(config, "", key, {})
-
-    def _member(self, cell: dict[str, Any], where: str, key: str, default: Any) -> Any:
-        """The object or list under a key; `default`, which tells the type, where there is none."""
-        value = cell.get(key, default)
-        if not isinstance(value, type(default)):
-            kind = "an object" if isinstance(default, dict) else "a list"
-            raise SceneError(f"{self.path}: {where}{'.' if where else ''}{key}: expected {kind}, got {shown(value)}")
-        return value
+        raise SceneError(f"{self.path}: has no scene {scene_id!r}; {hint}{examples}")
 
     def _listed(self, cell: dict[str, Any], key: str, ending: str) -> Iterator[Entry]:
         """Entries of the files that the search paths of a cell lead to."""
-        paths = self._member(cell, key, "paths", {})
+        paths = member(cell, "paths", {}, f"{self._where}{key}.")
         for kind in paths:
             # Habitat-Sim takes every kind that holds ".json" for one of configs, any other for one of assets.
             wanted = ending if ".json" in kind else kind
-            for pattern in self._member(paths, f"{key}.paths", kind, []):
-                for file in self._files(pattern, f"{self.path}: {key}.paths.{kind}", wanted):
+            for pattern in member(paths, kind, [], f"{self._where}{key}.paths."):
+                for file in self._files(pattern, f"{self._where}{key}.paths.{kind}", wanted):
                     yield Entry(file, self.folder / file)
 
-    def _files(self, pattern: Any, told_by: str, ending: str) -> list[str]:
+    def _files(self, pattern: Any, where: str, ending: str) -> list[str]:
         """Paths relative to the dataset's folder of what a pattern matches, and of what lies in matching folders."""
         if not isinstance(pattern, str) or not pattern or "\0" in pattern:
-            raise SceneError(f"{told_by}: expected a path, got {shown(pattern)}")
+            raise SceneError(f"{where}: expected a path, got {shown(pattern)}")
         if os.path.isabs(pattern) or os.path.normpath(pattern).split(os.sep)[0] == os.pardir:
-            raise SceneError(f"{told_by}: {pattern!r} lies outside of {self.folder}, the folder of its data")
+            raise SceneError(f"{where}: {pattern!r} lies outside of {self.folder}, the folder of its data")
         found = []
         for match in sorted(glob.glob(pattern, root_dir=self.folder)):
-            path = inside(self.folder / match, self.folder, told_by, match)
+            path = inside(self.folder / match, self.folder, where, match)
             names = [f"{match.rstrip('/')}/{name}" for name in sorted(os.listdir(path))] if path.is_dir() else [match]
             found += [os.path.normpath(name) for name in names if name.endswith(ending)]
         return found
@@ -153,58 +124,49 @@ class SceneDataset:
         if not isinstance(cell, dict) or not isinstance(cell.get("attributes"), dict):
             raise SceneError(f"{self.path}: {where}.attributes: expected an object, got {shown(cell)}")
         change = Layer(cell["attributes"], self.path, f"{where}.attributes.")
-        origin, handle = (self._text(cell, key, where) for key in ("original_file", "template_handle"))
-        if origin is None and handle is None:
+        given = {key: value for key, value in cell.items() if value is not None}
+        origin, handle = (
+            member(given, key, "", f"{self._where}{where}.") for key in ("original_file", "template_handle")
+        )
+        if origin:
+            before = self._stage_of(origin, f"{self._where}{where}.original_file")
+            if not handle:
+                self.stages.remove(before)
+            self.stages.append(Entry(handle or before.handle, before.file, (*before.changes, change)))
+        elif handle:
+            self.stages.append(Entry(handle, None, (change,)))
+        else:
             raise SceneError(f"{self.path}: {where}: expected original_file or template_handle")
-        if origin is None:
-            self.stages.append(Entry(str(handle), None, (change,)))
-            return
-        before = self._stage_of(origin, self.path, f"{where}.original_file")
-        if handle is None:
-            self.stages.remove(before)
-        self.stages.append(Entry(handle or before.handle, before.file, (*before.changes, change)))
 
-    def _text(self, cell: dict[str, Any], key: str, where: str) -> str | None:
-        value = cell.get(key)
-        if value is not None and not isinstance(value, str):
-            raise SceneError(f"{self.path}: {where}.{key}: expected a text, got {shown(value)}")
-        return value or None
-
-    def _stage_of(self, handle: str, path: Path, key: str) -> Entry:
+    def _stage_of(self, handle: str, where: str) -> Entry:
         for matches in _matches(handle, self.stages):
             return matches[0]
-        names = [entry.words for entry in self.stages]
-        near = difflib.get_close_matches(handle, names, n=1, cutoff=0.5)
+        near = difflib.get_close_matches(handle, [entry.words for entry in self.stages], n=1, cutoff=0.5)
         hint = f"; did you mean {near[0]}?" if near else ""
-        raise SceneError(f"{path}: {key}: {self.path.name} has no stage {handle!r}{hint}")
+        raise SceneError(f"{where}: {self.path.name} has no stage {handle!r}{hint}")
 
-    def _bare(self, entry: Entry) -> FoundScene:
-        stage, files = self._stage(entry)
-        return FoundScene(entry.name, entry.handle, stage, 0, files)
-
-    def _stage(self, entry: Entry) -> tuple[Stage, tuple[Path, ...]]:
-        """What a stage shows, and the configs of its own."""
-        has_default = "default_attributes" in self._stages
-        default = self._member(self._stages, "stages", "default_attributes", {})
+    def _stage(self, entry: Entry) -> SceneLocation:
+        default = member(self._stages, "default_attributes", {}, f"{self._where}stages.")
         layers = [Layer(default, self.path, "stages.default_attributes.")]
-        folder, files, axes = self.folder, (), Y_UP
+        folder, files, axes = self.folder, (self.path,), Y_UP
         if entry.file is not None:
             config = _config_of(entry.file)
             folder = config.parent
             if config.name.endswith(STAGE_CONFIG):
                 layers.append(Layer(read_config(config), config))
-                files = (config,)
+                files = (self.path, config)
                 axes = Y_UP if replica_scene(config) is None else Z_UP
             else:
                 layers.append(Layer({"render_asset": config.name}, self.path, "stages.paths."))
                 # Without a config, Habitat-Sim judges by the name, unless the dataset has defaults for its stages.
-                axes = Z_UP if config.name.endswith(".glb") and not has_default else Y_UP
+                axes = Z_UP if config.name.endswith(".glb") and "default_attributes" not in self._stages else Y_UP
         name = entry.words.rpartition("/")[2]
-        return read_stage([*layers, *entry.changes], folder, self.folder, name=name, axes=axes), files
+        asset, axes = read_stage([*layers, *entry.changes], folder, self.folder, name=name, axes=axes)
+        return SceneLocation(name, asset, *axes, dataset=self.path, files=files)
 
-    def _instance(self, entry: Entry) -> FoundScene:
+    def _instance(self, entry: Entry) -> SceneLocation:
         assert entry.file is not None
-        default = self._member(self._scenes, "scene_instances", "default_attributes", {})
+        default = member(self._scenes, "default_attributes", {}, f"{self._where}scene_instances.")
         content = {**default, **read_config(entry.file)}
         place = content.get("stage_instance")
         if not isinstance(place, dict) or not isinstance(place.get("template_name"), str):
@@ -214,19 +176,10 @@ class SceneDataset:
         expect_neutral(layer, "rotation", [1, 0, 0, 0], [-1, 0, 0, 0])
         expect_neutral(layer, "uniform_scale", 1)
         expect_neutral(layer, "non_uniform_scale", [1, 1, 1])
-        shows = self._stage_of(place["template_name"], entry.file, "stage_instance.template_name")
-        stage, files = self._stage(shows)
-        return FoundScene(entry.name, entry.handle, stage, _count_objects(content, entry.file), (entry.file, *files))
-
-
-def _count_objects(content: dict[str, Any], path: Path) -> int:
-    count = 0
-    for key in ("object_instances", "articulated_object_instances"):
-        value = content.get(key, [])
-        if not isinstance(value, list):
-            raise SceneError(f"{path}: {key}: expected a list, got {shown(value)}")
-        count += len(value)
-    return count
+        kinds = ("object_instances", "articulated_object_instances")
+        objects = sum(len(member(content, kind, [], f"{entry.file}: ")) for kind in kinds)
+        stage = self._stage(self._stage_of(place["template_name"], f"{entry.file}: stage_instance.template_name"))
+        return replace(stage, objects=objects, files=(self.path, entry.file, *stage.files[1:]))
 
 
 def _config_of(file: Path) -> Path:

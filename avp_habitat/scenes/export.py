@@ -1,12 +1,12 @@
 """`python -m avp_habitat.scenes.export`: write a scene as one self-contained `.glb` file."""
 
 import io
-import os
+import json
+import struct
 import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from tyro.conf import Positional, arg
 
 from avp_habitat import command
 from avp_habitat.errors import SceneError, UsageError
+from avp_habitat.files import atomic_file
 from avp_habitat.scenes.loader import load_scene
 from avp_habitat.scenes.location import HELP, UP_HELP
 from avp_habitat.scenes.mesh import TexturedMesh
@@ -37,110 +38,94 @@ def export_glb(mesh: TexturedMesh, path: Path) -> None:
     """
     if path.suffix.lower() != ".glb":
         raise UsageError(f"{path}: expected a name that ends in .glb")
-    if path.exists() or path.is_symlink():
-        raise UsageError(f"{path}: exists already; remove it or choose another name")
-    try:
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-            made = Path(folder) / path.name
-            made.write_bytes(_Document().encoded(mesh))
-            os.replace(made, path)
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be written: {error.strerror}") from error
+    if not path.parent.is_dir():
+        raise SceneError(f"{path}: cannot be written: there is no folder {path.parent}")
+    with atomic_file(path, replace=False, failure=SceneError) as made:
+        made.write_bytes(_Glb(mesh).encoded())
 
 
-class _Document:
+class _Glb:
     """A glTF document and its binary chunk."""
 
-    def __init__(self) -> None:
-        import pygltflib
-
-        self._gltf = pygltflib
+    def __init__(self, mesh: TexturedMesh) -> None:
         self._content = bytearray()
-        self._document = pygltflib.GLTF2(
-            scene=0,
-            scenes=[pygltflib.Scene(nodes=[0])],
-            nodes=[pygltflib.Node(mesh=0)],
-            meshes=[pygltflib.Mesh(primitives=[])],
-            extensionsUsed=[_UNLIT],
-            asset=pygltflib.Asset(version="2.0", generator="avp_habitat"),
-        )
-
-    def encoded(self, mesh: TexturedMesh) -> bytes:
-        """The file of a mesh."""
+        self._document: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": "avp_habitat"},
+            "extensionsUsed": [_UNLIT],
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0}],
+        }
         masks = np.full_like(mesh.texture_index, -1) if mesh.mask_index is None else mesh.mask_index
-        for texture, mask in sorted(set(zip(mesh.texture_index.tolist(), masks.tolist(), strict=True))):
-            self._add_primitive(mesh, (mesh.texture_index == texture) & (masks == mask), texture, mask)
-        self._document.buffers = [self._gltf.Buffer(byteLength=len(self._content))]
-        self._document.set_binary_blob(bytes(self._content))
-        return b"".join(self._document.save_to_bytes())
+        kinds = sorted(set(zip(mesh.texture_index.tolist(), masks.tolist(), strict=True)))
+        self._add("meshes", primitives=[
+            self._primitive(mesh, (mesh.texture_index == texture) & (masks == mask), texture, mask)
+            for texture, mask in kinds
+        ])  # fmt: skip
+        self._document["buffers"] = [{"byteLength": len(self._content)}]
 
-    def _add_primitive(self, mesh: TexturedMesh, own: NDArray[np.bool_], texture: int, mask: int) -> None:
-        """Append the triangles that share a texture and a mask (-1 for none), with a material of their own."""
-        gltf, document = self._gltf, self._document
+    def encoded(self) -> bytes:
+        """The file: a header, then the chunks of JSON and of data, each with its length and padded to four bytes."""
+        text = json.dumps(self._document).encode()
+        chunks = ((text + b" " * (-len(text) % 4), b"JSON"), (bytes(self._content), b"BIN\0"))
+        body = b"".join(struct.pack("<I4s", len(chunk), kind) + chunk for chunk, kind in chunks)
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+
+    def _primitive(self, mesh: TexturedMesh, own: NDArray[np.bool_], texture: int, mask: int) -> dict[str, Any]:
+        """The triangles that share a texture and a mask (-1 for none), with a material of their own."""
         used, corners = np.unique(mesh.triangles[own], return_inverse=True)
-        position, colour = self._add_array(mesh.vertices[used]), self._add_array(mesh.colours[used])
-        bounds = document.accessors[position]
-        bounds.min, bounds.max = (getattr(mesh.vertices[used], name)(axis=0).tolist() for name in ("min", "max"))
-        attributes = gltf.Attributes(POSITION=position, COLOR_0=colour)
-        shading = gltf.PbrMetallicRoughness(metallicFactor=0.0)
+        positions = mesh.vertices[used]
+        bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+        attributes = {"POSITION": self._array(positions, **bounds), "COLOR_0": self._array(mesh.colours[used])}
+        shading: dict[str, Any] = {"metallicFactor": 0.0}
         if texture >= 0:
-            attributes.TEXCOORD_0 = self._add_array(mesh.uv[used])
+            attributes["TEXCOORD_0"] = self._array(mesh.uv[used])
             pixels = mesh.textures[texture]
             if mask >= 0:
                 pixels = np.dstack([pixels, np.where(mesh.masks[mask], np.uint8(255), np.uint8(0))])
-            shading.baseColorTexture = gltf.TextureInfo(index=self._add_picture(pixels))
-        mode, cutoff = ("MASK", 0.5) if mask >= 0 else ("OPAQUE", None)
-        document.materials.append(
-            gltf.Material(
-                pbrMetallicRoughness=shading,
-                doubleSided=True,
-                alphaMode=mode,
-                alphaCutoff=cutoff,
-                extensions={_UNLIT: {}},
-            )
-        )
-        indices = self._add_array(corners.reshape(-1).astype(np.uint32))
-        material = len(document.materials) - 1
-        document.meshes[0].primitives.append(gltf.Primitive(attributes=attributes, indices=indices, material=material))
+            shading["baseColorTexture"] = {"index": self._texture(pixels)}
+        material = {"pbrMetallicRoughness": shading, "doubleSided": True, "extensions": {_UNLIT: {}}}
+        masked = {"alphaMode": "MASK", "alphaCutoff": 0.5} if mask >= 0 else {}
+        indices = self._array(corners.reshape(-1).astype(np.uint32))
+        return {"attributes": attributes, "indices": indices, "material": self._add("materials", **material, **masked)}
 
-    def _add_array(self, values: NDArray) -> int:
+    def _array(self, values: NDArray, **bounds: list[float]) -> int:
         """Accessor of `(n, 2)` or `(n, 3)` floats, or of `(n,)` vertex indices."""
-        scalar = values.ndim == 1
-        target, component, stored = (_ELEMENT_BUFFER, _UINT32, "<u4") if scalar else (_ARRAY_BUFFER, _FLOAT, "<f4")
-        view = self._add_view(np.ascontiguousarray(values, stored).tobytes(), target)
-        kind = "SCALAR" if scalar else f"VEC{values.shape[1]}"
-        self._document.accessors.append(
-            self._gltf.Accessor(bufferView=view, componentType=component, count=len(values), type=kind)
-        )
-        return len(self._document.accessors) - 1
+        if values.ndim == 1:
+            target, component, stored, kind = _ELEMENT_BUFFER, _UINT32, "<u4", "SCALAR"
+        else:
+            target, component, stored, kind = _ARRAY_BUFFER, _FLOAT, "<f4", f"VEC{values.shape[1]}"
+        view = self._view(np.ascontiguousarray(values, stored).tobytes(), target=target)
+        return self._add("accessors", bufferView=view, componentType=component, count=len(values), type=kind, **bounds)
 
-    def _add_picture(self, pixels: NDArray[np.uint8]) -> int:
-        """Texture of `(height, width, 3 or 4)` pixels, repeating, stored as PNG."""
+    def _texture(self, pixels: NDArray[np.uint8]) -> int:
+        """Of `(height, width, 3 or 4)` pixels, repeating, stored as PNG."""
         from PIL import Image
 
         encoded = io.BytesIO()
         Image.fromarray(np.ascontiguousarray(pixels)).save(encoded, format="PNG")
-        gltf, document = self._gltf, self._document
-        document.images.append(gltf.Image(bufferView=self._add_view(encoded.getvalue()), mimeType="image/png"))
-        document.samplers = [gltf.Sampler(magFilter=_LINEAR, minFilter=_MIPMAPS)]
-        document.textures.append(gltf.Texture(source=len(document.images) - 1, sampler=0))
-        return len(document.textures) - 1
+        image = self._add("images", bufferView=self._view(encoded.getvalue()), mimeType="image/png")
+        self._document["samplers"] = [{"magFilter": _LINEAR, "minFilter": _MIPMAPS}]
+        return self._add("textures", source=image, sampler=0)
 
-    def _add_view(self, content: bytes, target: int | None = None) -> int:
+    def _view(self, content: bytes, **target: int) -> int:
         start = len(self._content)
-        self._document.bufferViews.append(
-            self._gltf.BufferView(buffer=0, byteOffset=start, byteLength=len(content), target=target)
-        )
         self._content += content + b"\0" * (-len(content) % 4)
-        return len(self._document.bufferViews) - 1
+        return self._add("bufferViews", buffer=0, byteOffset=start, byteLength=len(content), **target)
+
+    def _add(self, kind: str, **entry: Any) -> int:
+        """Append to one of the document's lists; the index there."""
+        entries = self._document.setdefault(kind, [])
+        entries.append(entry)
+        return len(entries) - 1
 
 
 @dataclass(frozen=True)
 class Export:
     """Export a scene, most usefully a generated room, for other programs."""
 
-    scene: Positional[Annotated[str, arg(help=HELP)]]
-    out: Positional[Path]
+    scene: Positional[Annotated[str, arg(help=HELP, metavar="SCENE")]]
+    out: Positional[Annotated[Path, arg(metavar="OUT")]]
     """The .glb file to write; must not exist."""
     up: Annotated[Literal["y", "z"] | None, arg(help=UP_HELP)] = None
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles, check_memory, decode_picture
 from avp_habitat.scenes.gltf_materials import SUPPORTED, Surface, ignored, surface_of
-from avp_habitat.scenes.mesh import TexturedMesh, merge, only, say_once, with_mask
+from avp_habitat.scenes.mesh import TexturedMesh, merge, only, warn_once, with_mask
 
 _COMPONENT = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -120,14 +120,16 @@ class _Buffers:
                     f"file whose buffers hold {most} bytes"
                 )
             values = np.zeros(shape, dtype)
-        if (sparse := accessor.sparse) is not None:
-            values = values.copy()
-            rows = self._list(sparse.indices, np.dtype(_COMPONENT[sparse.indices.componentType]), sparse.count)
-            values[rows] = self._list(sparse.values, dtype, sparse.count * shape[1]).reshape(-1, shape[1])
+        if accessor.sparse is not None:
+            values = self._with_sparse(accessor.sparse, values.copy())
         return _fractions(values) if accessor.normalized else values
 
-    def _list(self, entry: Any, dtype: np.dtype, count: int) -> NDArray:
-        return np.frombuffer(self.view(entry.bufferView), dtype, count, entry.byteOffset or 0)
+    def _with_sparse(self, sparse: Any, values: NDArray) -> NDArray:
+        (where, what), count = (sparse.indices, sparse.values), sparse.count
+        rows = np.frombuffer(self.view(where.bufferView), _COMPONENT[where.componentType], count, where.byteOffset or 0)
+        new = np.frombuffer(self.view(what.bufferView), values.dtype, count * values.shape[1], what.byteOffset or 0)
+        values[rows] = new.reshape(count, -1)
+        return values
 
     def _buffer(self, index: int) -> bytes:
         if index not in self._content:
@@ -180,14 +182,14 @@ class _Reader:
     def mesh(self) -> TexturedMesh:
         """All triangles of the default scene, placed in the world."""
         if phrases := ignored(self._document):
-            say_once(str(self._path), "; ".join(phrases))
+            warn_once(str(self._path), "; ".join(phrases))
         placed = list(self._placed())
         # A small file can name the same vertices again and again.
         check_memory(f"{self._path}: its mesh", sum(self._bytes_of(primitive) for primitive, _ in placed))
         parts = [part for each in placed if (part := self._primitive(*each)) is not None]
-        if not parts:
-            raise SceneError(f"{self._path}: expected a mesh with triangles, found none in the default scene")
-        return merge(parts)
+        if parts:
+            return merge(parts)
+        raise SceneError(f"{self._path}: expected a mesh with triangles, found none in the default scene")
 
     def _placed(self) -> Iterator[tuple[pygltflib.Primitive, NDArray]]:
         """Primitives with their `(4, 4)` transforms to the world, in document order."""
@@ -277,7 +279,7 @@ class _Reader:
         found: Any = pygltflib.Sampler() if sampler is None else self._document.samplers[sampler]
         repeated = np.isin([found.wrapS or _REPEAT, found.wrapT or _REPEAT], _REPEAT)
         if (((uv < -_EDGE) | (uv > 1 + _EDGE)) & ~repeated).any():
-            say_once(str(self._path), "textures that are clamped or mirrored beyond their edges are repeated there")
+            warn_once(str(self._path), "textures that are clamped or mirrored beyond their edges are repeated there")
         return uv
 
     def _colours(self, attributes: Any, surface: Surface, vertices: int) -> NDArray[np.float32]:

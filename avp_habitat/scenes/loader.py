@@ -11,10 +11,11 @@ from avp_habitat.errors import SceneError
 from avp_habitat.poses import axes_to_world
 from avp_habitat.scenes.files import SceneFiles
 from avp_habitat.scenes.location import BUILTIN, Frame, SceneLocation, locate
-from avp_habitat.scenes.mesh import TexturedMesh, say_once
+from avp_habitat.scenes.mesh import TexturedMesh, warn_once
+from avp_habitat.scenes.obj import read_obj
+from avp_habitat.scenes.ply import read_ply
 from avp_habitat.scenes.stage_config import Y_UP, Axes
 
-_GLTF = (".glb", ".gltf")
 _MOST_LOST_MM = 100
 _FAR_M = 1000.0
 """From here on, float32 has steps of more than 0.06 mm."""
@@ -59,7 +60,7 @@ def load_located(location: SceneLocation, *, origin: Sequence[float] | None = No
     if location.asset is None:
         from avp_habitat.scenes.builtin.room import generate_room
 
-        return Scene(location.name, identify(location)[0], generate_room(_seed(location)))
+        return Scene(location.name, identify(location)[0], generate_room(int(location.name.removeprefix(BUILTIN))))
     if location.objects:
         raise SceneError(
             f"{location.dataset}:{location.scene_id}: has {location.objects} objects besides its stage, which raycast "
@@ -83,10 +84,9 @@ def identify(location: SceneLocation) -> tuple[str, Frame]:
     if location.asset is None:
         from avp_habitat.scenes.builtin.room import GENERATOR_VERSION
 
-        text = f"{BUILTIN}{_seed(location)}:v{GENERATOR_VERSION}"
-        return hashlib.sha256(text.encode()).hexdigest(), Frame()
+        return hashlib.sha256(f"{location.name}:v{GENERATOR_VERSION}".encode()).hexdigest(), Frame()
     files = SceneFiles(location.asset)
-    frame = Frame(up=location.told_up)
+    frame = Frame(up=location.chosen_up)
     try:
         frame = _placed(_read(files), location)[1]
     except SceneError as error:
@@ -94,10 +94,6 @@ def identify(location: SceneLocation) -> tuple[str, Frame]:
         if "KHR_texture_basisu" not in str(error):
             raise
     return _digest(location, files), frame
-
-
-def _seed(location: SceneLocation) -> int:
-    return int(location.name.removeprefix(BUILTIN))
 
 
 def _digest(location: SceneLocation, files: SceneFiles) -> str:
@@ -112,13 +108,14 @@ def _digest(location: SceneLocation, files: SceneFiles) -> str:
 
 def _read(files: SceneFiles) -> TexturedMesh:
     suffix = files.path.suffix.lower()
-    if suffix in _GLTF:
-        from avp_habitat.scenes.gltf import read_gltf as read
-    elif suffix == ".ply":
-        from avp_habitat.scenes.ply import read_ply as read
+    if suffix == ".ply":
+        mesh = read_ply(files)
+    elif suffix == ".obj":
+        mesh = read_obj(files)
     else:
-        from avp_habitat.scenes.obj import read_obj as read
-    mesh = read(files)
+        from avp_habitat.scenes.gltf import read_gltf
+
+        mesh = read_gltf(files)
     _check_numbers(mesh, files.path)
     return mesh
 
@@ -128,7 +125,7 @@ def _placed(
 ) -> tuple[TexturedMesh, Frame]:
     """The mesh in the world, and what has to be said of how it lies there."""
     asset = str(location.asset)
-    lost = 0.0 if asset.lower().endswith(".obj") else _lost_mm(mesh)
+    lost = 0.0 if asset.lower().endswith(".obj") else _float32_step_mm(mesh)
     mesh, moved = _place(mesh, (location.up, location.front), origin, asset)
     if any(moved):
         far = f"{max(map(abs, moved)):.0f} m"
@@ -138,11 +135,11 @@ def _placed(
                 "expected a mesh that was exported near its origin"
             )
         text = f"lies {far} from its origin: ({', '.join(f'{each:.0f}' for each in moved)}) m are taken off"
-        say_once(asset, text + (f"; as float32, its coordinates are rounded to {lost:.0f} mm" if lost >= 1 else ""))
-    if (location.up, location.front) == Y_UP and location.told_up is None and looks_z_up(mesh):
+        warn_once(asset, text + (f"; as float32, its coordinates are rounded to {lost:.0f} mm" if lost >= 1 else ""))
+    if (location.up, location.front) == Y_UP and location.chosen_up is None and looks_z_up(mesh):
         own = f'"up": [0, 0, 1], "front": [0, 1, 0] in {location.files[-1].name}' if location.files else "--up z"
-        say_once(asset, f"is taken as Y-up, but looks like a Z-up room on its side; if it is one, say {own}")
-    return mesh, Frame(moved, location.told_up)
+        warn_once(asset, f"is taken as Y-up, but looks like a Z-up room on its side; if it is one, say {own}")
+    return mesh, Frame(moved, location.chosen_up)
 
 
 def _check_numbers(mesh: TexturedMesh, path: Path) -> None:
@@ -158,7 +155,7 @@ def _check_numbers(mesh: TexturedMesh, path: Path) -> None:
             )
 
 
-def _lost_mm(mesh: TexturedMesh) -> float:
+def _float32_step_mm(mesh: TexturedMesh) -> float:
     """Step in millimetres of the greatest coordinate, when the file's numbers are no finer than float32; else 0."""
     largest = np.abs(mesh.vertices).max()
     if not largest < np.finfo(np.float32).max or (mesh.vertices.astype(np.float32) != mesh.vertices).any():

@@ -2,7 +2,7 @@
 
 import difflib
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from avp_habitat.errors import AVPError, SceneError, UsageError
@@ -14,7 +14,7 @@ from avp_habitat.scenes.stage_config import (
     Y_UP,
     Z_UP,
     Layer,
-    Vector,
+    SceneLocation,
     is_replica_scene,
     read_config,
     read_stage,
@@ -44,30 +44,6 @@ class Frame:
     """The axis of the file that was said to point up; None where nobody said."""
 
 
-@dataclass(frozen=True)
-class SceneLocation:
-    """Where a scene is."""
-
-    name: str
-    """As rollouts call it, without folders: a file's name, `room_0`, or `builtin:SEED`."""
-    asset: Path | None
-    """The mesh file that is shown; None for a generated room."""
-    up: Vector = Y_UP[0]
-    """Unit vector in the asset's coordinates that points up."""
-    front: Vector = Y_UP[1]
-    """Unit vector in the asset's coordinates, at right angles to `up`, that becomes the world's -Z."""
-    told_up: str | None = None
-    """The axis that the user said points up, None for what the file or its config says."""
-    dataset: Path | None = None
-    """The scene dataset config that the scene belongs to, None for one that was named without it."""
-    scene_id: str | None = None
-    """The scene's id there: the handle that the user's id stands for, which no other scene has."""
-    objects: int = 0
-    """Objects, articulated ones included, that the scene has beyond its stage."""
-    files: tuple[Path, ...] = field(default=())
-    """The configs that were read: of the dataset, of the scene, of the stage."""
-
-
 def locate(spec: str | Path, *, up: str | None = None) -> SceneLocation:
     """Find a scene without reading its mesh.
 
@@ -90,7 +66,8 @@ def locate(spec: str | Path, *, up: str | None = None) -> SceneLocation:
     if up is not None and path.name.endswith((DATASET_CONFIG, STAGE_CONFIG)):
         raise UsageError(f"up: {path} says itself which axis of its mesh points up; expected none beside it, got {up}")
     if path.name.endswith(DATASET_CONFIG):
-        return _in_dataset(path, scene_id)
+        _expect_file(path, (DATASET_CONFIG,))
+        return SceneDataset(path).scene(scene_id)
     if path.name.endswith(STAGE_CONFIG):
         return _stage(path)
     if path.is_dir():
@@ -98,11 +75,12 @@ def locate(spec: str | Path, *, up: str | None = None) -> SceneLocation:
     elif path.suffix.lower() not in SUFFIXES:
         raise _unknown(path)
     _expect_file(path, SUFFIXES)
-    found = _mesh(path)
+    scene = replica_scene(path)
+    found = SceneLocation(path.name, path) if scene is None else SceneLocation(scene.name, path, *Z_UP)
     if up is None:
         return found
     axes = {"y": Y_UP, "z": Z_UP}[up]
-    return replace(found, up=axes[0], front=axes[1], told_up=up)
+    return replace(found, up=axes[0], front=axes[1], chosen_up=up)
 
 
 def _seed(spec: str) -> int:
@@ -110,11 +88,6 @@ def _seed(spec: str) -> int:
     if not (text.isascii() and text.isdigit()):
         raise UsageError(f"{spec}: expected {BUILTIN}SEED with an integer SEED >= 0, got {text!r}")
     return int(text)
-
-
-def _mesh(path: Path) -> SceneLocation:
-    scene = replica_scene(path)
-    return SceneLocation(path.name, path) if scene is None else SceneLocation(scene.name, path, *Z_UP)
 
 
 def _replica_scenes(folder: Path) -> list[str]:
@@ -136,22 +109,8 @@ def _stage(path: Path) -> SceneLocation:
     scene, name = replica_scene(path), path.name.removesuffix(STAGE_CONFIG)
     # Replica's stage config lies in habitat/ and shows ../mesh.ply, so the folder above is part of the data.
     root, axes = Path(os.path.abspath(path)).parents[1], Y_UP if scene is None else Z_UP
-    stage = read_stage([Layer(read_config(path), path)], path.parent, root, name=name, axes=axes)
-    return SceneLocation(name if scene is None else scene.name, stage.asset, *stage.axes, files=(path,))
-
-
-def _in_dataset(path: Path, scene_id: str) -> SceneLocation:
-    _expect_file(path, (DATASET_CONFIG,))
-    found = SceneDataset(path).scene(scene_id)
-    return SceneLocation(
-        found.name,
-        found.stage.asset,
-        *found.stage.axes,
-        dataset=path,
-        scene_id=found.handle,
-        objects=found.objects,
-        files=(path, *found.files),
-    )
+    asset, axes = read_stage([Layer(read_config(path), path)], path.parent, root, name=name, axes=axes)
+    return SceneLocation(name if scene is None else scene.name, asset, *axes, files=(path,))
 
 
 def _unknown(path: Path) -> AVPError:

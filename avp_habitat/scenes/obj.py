@@ -8,8 +8,7 @@ import numpy as np
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles, decode_picture
-from avp_habitat.scenes.mesh import TexturedMesh, say_once
-from avp_habitat.scenes.polygons import triangulate
+from avp_habitat.scenes.mesh import TexturedMesh, triangulate, warn_once
 
 _MOST = 2**31 - 1
 """What an index of 32 bits can hold."""
@@ -217,13 +216,13 @@ class _Reader:
         material = _Material() if name is None else self._library.get(name)
         path = str(self._files.path)
         if material is None:
-            say_once(path, f"its material {name!r} is in none of its libraries and is shown white")
+            warn_once(path, f"its material {name!r} is in none of its libraries and is shown white")
             return _Material()
         if material.picture and not any(material.diffuse):
-            say_once(path, f"its material {name!r} has a picture and a black Kd, which is taken for white")
+            warn_once(path, f"its material {name!r} has a picture and a black Kd, which is taken for white")
             material = replace(material, diffuse=_WHITE)
         if material.lost:
-            say_once(path, f"of its material {name!r}, {', '.join(material.lost)} is not followed")
+            warn_once(path, f"of its material {name!r}, {', '.join(material.lost)} is not followed")
         return material
 
 

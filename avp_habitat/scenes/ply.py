@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles, decode_picture
-from avp_habitat.scenes.mesh import TexturedMesh, say_once
-from avp_habitat.scenes.polygons import triangulate
+from avp_habitat.scenes.mesh import TexturedMesh, triangulate, warn_once
 
 _CODES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _CODES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
@@ -31,13 +30,12 @@ _MALFORMED = (ArithmeticError, LookupError, TypeError, ValueError, struct.error)
 
 @dataclass(frozen=True)
 class _Property:
+    """How values lie in the body, where a text's numbers are float64; a single value has no type of a count."""
+
     name: str
     values: np.dtype
-    """As they lie in the body; every number of a text is a float64 there."""
     count: np.dtype | None
-    """Of a list's number of values; None for a single value."""
     integer: bool
-    """Whether the header says that the values are whole numbers."""
 
 
 @dataclass(frozen=True)
@@ -109,18 +107,15 @@ def _header(lines: list[list[str]]) -> tuple[str, list[_Element]]:
             if elements[-1].rows < 0:
                 raise ValueError(f"element {words[1]} has {words[2]} rows")
         elif words[0] == "property":
-            elements[-1].properties.append(_property(words[1:], order))
+            codes = [_CODES.get(word) for word in (words[2:4] if words[1] == "list" else words[1:2])]
+            if None in codes or not order:
+                raise ValueError(f"expected a property of a known type, got {' '.join(words[1:])}")
+            *count, values = (np.dtype("=f8" if order == "=" else f"{order}{code}") for code in codes)
+            integer = str(codes[-1])[0] in "iu"
+            elements[-1].properties.append(_Property(words[-1], values, count[0] if count else None, integer))
     if not order:
         raise ValueError("the header names no format")
     return order, elements
-
-
-def _property(words: list[str], order: str) -> _Property:
-    codes = [_CODES.get(word) for word in (words[1:3] if words[0] == "list" else words[:1])]
-    if None in codes or not order:
-        raise ValueError(f"expected a property of a known type, got {' '.join(words)}")
-    stored = [np.dtype("=f8" if order == "=" else f"{order}{code}") for code in codes]
-    return _Property(words[-1], stored[-1], stored[0] if len(stored) == 2 else None, str(codes[-1])[0] in "iu")
 
 
 def _numbers(text: bytes) -> bytes:
@@ -236,7 +231,7 @@ def _mesh(files: SceneFiles, tables: dict[str, _Columns], pictures: list[str]) -
         uv = next((found for names in _COORDINATES if (found := _together(vertex, names)) is not None), None)
     textures = [decode_picture(files.read(name), f"{files.path}: {name}") for name in pictures]
     if colours is None and not (textures and uv is not None):
-        _say_what_is_lost(files, [*vertex, *face], pictures)
+        _warn_of_unread_colours(files, [*vertex, *face], pictures)
     if uv is None:
         textures = []
     return TexturedMesh(
@@ -284,10 +279,10 @@ def _texture_index(face: _Columns, faces: NDArray[np.int64], textures: int) -> N
     return np.where((named >= 0) & (named < textures), named, -1).astype(np.int32)
 
 
-def _say_what_is_lost(files: SceneFiles, properties: list[str], pictures: list[str]) -> None:
+def _warn_of_unread_colours(files: SceneFiles, properties: list[str], pictures: list[str]) -> None:
     names = [name for name in properties if _COLOUR_LIKE.search(name)]
     if names:
         known = "colours are read from " + ", ".join("/".join(each) for each in _COLOURS)
-        say_once(str(files.path), f"is shown white: its {', '.join(names)} are not followed ({known})")
+        warn_once(str(files.path), f"is shown white: its {', '.join(names)} are not followed ({known})")
     elif pictures:
-        say_once(str(files.path), f"is shown white: it names {', '.join(pictures)}, but has no texture coordinates")
+        warn_once(str(files.path), f"is shown white: it names {', '.join(pictures)}, but has no texture coordinates")

@@ -20,12 +20,13 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SUFFIXES, broken_link
 
 STAGE_CONFIG = ".stage_config.json"
+Value = TypeVar("Value")
 Vector = tuple[float, float, float]
 Axes = tuple[Vector, Vector]
 Y_UP: Axes = ((0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
@@ -56,11 +57,27 @@ class Layer:
 
 
 @dataclass(frozen=True)
-class Stage:
-    """What a stage shows: a mesh file that exists, and unit vectors up and front in it, at right angles."""
+class SceneLocation:
+    """Where a scene is."""
 
-    asset: Path
-    axes: Axes
+    name: str
+    """As rollouts call it, without folders: a file's name, `room_0`, or `builtin:SEED`."""
+    asset: Path | None
+    """The mesh file that is shown; None for a generated room."""
+    up: Vector = Y_UP[0]
+    """Unit vector in the asset's coordinates that points up."""
+    front: Vector = Y_UP[1]
+    """Unit vector in the asset's coordinates, at right angles to `up`, that becomes the world's -Z."""
+    chosen_up: str | None = None
+    """The axis that the user said points up, None for what the file or its config says."""
+    dataset: Path | None = None
+    """The scene dataset config that the scene belongs to, None for one that was named without it."""
+    scene_id: str | None = None
+    """The scene's id there: the handle that the user's id stands for, which no other scene has."""
+    objects: int = 0
+    """Objects, articulated ones included, that the scene has beyond its stage."""
+    files: tuple[Path, ...] = ()
+    """The configs that were read: of the dataset, of the scene, of the stage."""
 
 
 def replica_scene(path: Path) -> Path | None:
@@ -96,8 +113,17 @@ def read_config(path: Path) -> dict[str, Any]:
     return content
 
 
-def read_stage(layers: Sequence[Layer], folder: Path, root: Path, *, name: str, axes: Axes = Y_UP) -> Stage:
-    """The stage that attributes describe.
+def member(cell: Any, key: str, default: Value, where: str) -> Value:
+    """The object, list or text under a key of a JSON object, or the default; SceneError where it is something else."""
+    value = cell.get(key, default) if isinstance(cell, dict) else cell
+    if not isinstance(value, type(default)):
+        kind = {dict: "an object", list: "a list", str: "a text"}[type(default)]
+        raise SceneError(f"{where}{key}: expected {kind}, got {shown(value)}")
+    return value
+
+
+def read_stage(layers: Sequence[Layer], folder: Path, root: Path, *, name: str, axes: Axes = Y_UP) -> tuple[Path, Axes]:
+    """The mesh file that a stage of some attributes shows, and its up and front.
 
     Args:
         layers: the attributes; the last layer is the stage's own.
@@ -117,7 +143,7 @@ def read_stage(layers: Sequence[Layer], folder: Path, root: Path, *, name: str, 
         # Habitat-Sim takes a mesh of such a name for one with semantic labels, and after it has applied the config's
         # axes, it turns the mesh from Z-up to Y-up (ResourceManager and GenericSemanticMeshData in its sources).
         up, front = (0.0 - front[0], 0.0 - front[1], 0.0 - front[2]), up
-    return Stage(asset, (up, front))
+    return asset, (up, front)
 
 
 def find(layers: Sequence[Layer], key: str) -> tuple[Any, Layer]:
@@ -141,14 +167,14 @@ def expect_neutral(layers: Sequence[Layer], key: str, *neutral: Any) -> None:
     )
 
 
-def inside(target: Path, root: Path, told_by: str, value: str) -> Path:
+def inside(target: Path, root: Path, where: str, value: str) -> Path:
     """The same path without `..`; SceneError where it leaves the data set's folder.
 
     What counts is the path as it is written: links may lead anywhere.
     """
     # No file system takes the null character, and asking about one is an error of its own.
     if "\0" in value or not Path(os.path.abspath(target)).is_relative_to(os.path.abspath(root)):
-        raise SceneError(f"{told_by}: {value!r} lies outside of {root}, the folder of its data")
+        raise SceneError(f"{where}: {value!r} lies outside of {root}, the folder of its data")
     return Path(os.path.normpath(target))
 
 

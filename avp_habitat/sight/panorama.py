@@ -1,7 +1,8 @@
-"""Depth statistics of every view from a point, computed from one panorama of distances around that point.
+"""Least and mean depth of every view from a place, computed from one panorama of distances around it.
 
 A panorama holds the inverse distance along directions on a regular grid of azimuth and elevation. Inverse distance is
-close to linear over the image of a plane, so values between the directions are interpolated bilinearly.
+close to linear over the image of a plane, so values between the directions are interpolated bilinearly, and so are the
+statistics between places, yaws and pitches.
 """
 
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.compiled import njit
 from avp_habitat.poses import Intrinsics, camera_to_world
+from avp_habitat.simulators.base import SingleRays
 
 Float = NDArray[np.floating]
 
@@ -20,7 +22,9 @@ STEP_DEG = 2.5
 AZIMUTHS = round(360 / STEP_DEG)
 ELEVATIONS = round(180 / STEP_DEG) + 1
 YAWS = AZIMUTHS // 2
+"""Of the statistics, beginning with yaw 0."""
 PITCH_STEP_DEG = 10.0
+"""Between neighbouring pitches of the statistics."""
 _COLUMNS, _ROWS = 20, 15
 
 
@@ -45,6 +49,13 @@ def directions() -> NDArray[np.float64]:
     flat = np.cos(elevation)
     parts = (-np.sin(azimuth) * flat, np.sin(elevation) + 0 * azimuth, -np.cos(azimuth) * flat)
     return np.stack(np.broadcast_arrays(*parts), axis=-1)
+
+
+def look_around(simulator: SingleRays, eye: Float) -> Float:
+    """`(k, AZIMUTHS, ELEVATIONS)` metres along `directions()` from `(k, 3)` places, inf where nothing is hit."""
+    ways = directions().reshape(-1, 3)
+    distance = simulator.distance(np.repeat(eye, len(ways), axis=0), np.tile(ways, (len(eye), 1)))
+    return distance.reshape(len(eye), AZIMUTHS, ELEVATIONS)
 
 
 @lru_cache(maxsize=4)
@@ -117,3 +128,33 @@ def _statistics(inverse, azimuth, elevation, cosine, inner, max_range_m, result)
                         total += 1 / value
                 result[k, yaw, pitch, 0] = np.uint16(65535 / greatest + 0.5)
                 result[k, yaw, pitch, 1] = np.uint16(65535 * total / inner + 0.5)
+
+
+@njit(cache=True)
+def interpolate(statistics, slots, weights, yaw, pitch):
+    """Least and mean depth of views, `(k,)` each, as shares of the range, between places, yaws and pitches.
+
+    Args:
+        statistics: `(slots, yaws, pitches, 2)` of `view_statistics`.
+        slots: `(k, 4)` places around each agent.
+        weights: `(k, 4)` of those places.
+        yaw: `(k,)` in steps of the table, from 0.
+        pitch: `(k,)` in steps of the table from its lowest pitch.
+    """
+    least, mean = np.empty(len(slots)), np.empty(len(slots))
+    yaws, pitches = statistics.shape[1:3]
+    for k in range(len(slots)):
+        y0 = int(np.floor(yaw[k]))
+        # The last pitch lies on the table's border: the entry beyond it has no weight and is not read.
+        p0 = min(max(int(np.floor(pitch[k])), 0), max(pitches - 2, 0))
+        wy, wp = yaw[k] - y0, pitch[k] - p0
+        low, average = 0.0, 0.0
+        for entry in range(16):
+            corner, turn, tilt = entry // 4, entry // 2 % 2, entry % 2
+            share = weights[k, corner] * (wy if turn else 1 - wy) * (wp if tilt else 1 - wp)
+            if share != 0:
+                at = statistics[slots[k, corner], (y0 + turn) % yaws, p0 + tilt]
+                low += share * at[0]
+                average += share * at[1]
+        least[k], mean[k] = low / 65535, average / 65535
+    return least, mean

@@ -8,7 +8,9 @@ Tables are made tile by tile where agents come, so large scenes cost what is vis
 
 import hashlib
 import weakref
-from dataclasses import astuple, dataclass
+from collections.abc import Callable, Hashable
+from dataclasses import astuple
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +18,18 @@ from numpy.typing import NDArray
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics, camera_to_world
 from avp_habitat.sight import panorama
-from avp_habitat.sight.rows import Lattice, PlaceRows, TileFiles, words_for
+from avp_habitat.sight.bits import Bits, pack, words_for
+from avp_habitat.sight.lattice import Columns, Lattice, PlaceTable
 from avp_habitat.simulators.base import Simulator, SingleRays
 from avp_habitat.task.settings import TaskSettings
 
 Float = NDArray[np.floating]
+Made = TypeVar("Made")
 
+SPACING_M = 0.1
+"""Distance between lattice points in metres. At 0.2 m the least depth is off by twice as much (docs/training.md)."""
+
+_VERSION = 3
 # Six square images around a place; a little wider than a quarter turn, so that no point falls between two of them.
 _AROUND = camera_to_world(
     np.zeros((6, 3)), yaw=np.radians([0.0, 90, 180, 270, 0, 0]), pitch=np.radians([0.0, 0, 0, 0, 90, -90])
@@ -72,9 +80,7 @@ def reached_around(
     return simulator.visible(pose, _SIDE, points, images, tolerance_m=tolerance_m)
 
 
-def seen_bits(
-    simulator: Simulator, eye: Float, points: Float, *, reach_m: Float | float, tolerance_m: float
-) -> NDArray[np.uint64]:
+def seen_bits(simulator: Simulator, eye: Float, points: Float, *, reach_m: Float | float, tolerance_m: float) -> Bits:
     """Look from every place at every point in reach.
 
     Args:
@@ -85,112 +91,95 @@ def seen_bits(
         tolerance_m: a hit this close before a point still reaches it, metres along the ray.
 
     Returns:
-        `(k, words)`: bit j % 64 of word j // 64 says whether point j is seen from the place.
+        `(k, words)` bit sets of the points that are seen from each place.
     """
     pairs = np.argwhere(((points[None] - eye[:, None]) ** 2).sum(axis=-1) <= np.square(reach_m))
     seen = reached_around(simulator, eye, points, pairs, tolerance_m=tolerance_m)
-    bits = np.zeros((len(eye), words_for(len(points)) * 64), dtype=np.bool_)
-    bits[pairs[seen, 0], pairs[seen, 1]] = True
-    return np.packbits(bits, axis=1, bitorder="little").view("<u8").astype(np.uint64)
+    members = np.zeros((len(eye), len(points)), dtype=np.bool_)
+    members[pairs[seen, 0], pairs[seen, 1]] = True
+    return pack(members)
 
 
-SPACING_M = 0.1
-"""Distance between lattice points in metres. At 0.2 m the least depth is off by twice as much (docs/training.md)."""
-_VERSION = 3
+_kept: weakref.WeakKeyDictionary[Simulator, dict[Hashable, Any]] = weakref.WeakKeyDictionary()
 
 
-@dataclass(frozen=True)
-class ViewKey:
-    """What the tables depend on besides the scene."""
+def once_per_simulator(simulator: Simulator, key: Hashable, make: Callable[[], Made]) -> Made:
+    """What was made of an open simulator before, or is made now; it lives as long as the simulator.
 
-    sensor_height_m: float
-    """Height of the camera above the floor, metres."""
-    intrinsics: Intrinsics
-    """Of the depth image whose statistics are looked up."""
-    pitch_limit_deg: float
-    """Greatest pitch, degrees."""
-    max_range_m: float
-    """Range of the depth and of the coverage, metres."""
-    tolerance_m: float
-    """Of the coverage, metres."""
-    spacing_m: float = SPACING_M
-    """Of the lattice, metres."""
-
-    @property
-    def pitches(self) -> tuple[float, ...]:
-        """Pitches of the statistics in radians: multiples of 10° up to the limit, and one beyond unless it is one."""
-        most = int(np.ceil(self.pitch_limit_deg / panorama.PITCH_STEP_DEG - 1e-9))
-        return tuple(np.radians(panorama.PITCH_STEP_DEG * np.arange(-most, most + 1)).tolist())
-
-
-class SceneTables:
-    """The tables of one scene, growing with the places that were asked for."""
-
-    def __init__(self, simulator: SingleRays, key: ViewKey) -> None:
-        """Make empty tables.
-
-        Args:
-            simulator: casts the rays.
-            key: of the views.
-        """
-        # Not held: the tables live as long as their simulator, whose users hold it.
-        self._simulator: SingleRays = weakref.proxy(simulator)
-        self.key = key
-        self._samples = panorama.view_samples(key.intrinsics, key.pitches)
-        self._directions = panorama.directions().reshape(-1, 3)
-        self.lattice = Lattice(simulator.area, key.spacing_m)
-        centres = simulator.area.centres
-        # Bits stand for cells: another NavMesh of the same scene has others.
-        content = hashlib.sha256(centres.tobytes())
-        content.update(f"{simulator.scene_digest} {_VERSION} {astuple(key)}".encode())
-        empty = {
-            "visible": np.zeros((0, words_for(len(centres))), dtype=np.uint64),
-            "statistics": np.zeros((0, panorama.YAWS, len(key.pitches), 2), dtype=np.uint16),
-        }
-        self._rows = PlaceRows(self.lattice, TileFiles(content.hexdigest()[:32]), empty, self._compute)
-
-    @property
-    def visible(self) -> NDArray[np.uint64]:
-        """`(slots, words)`: bit c % 64 of word c // 64 says whether cell c is seen from the slot's place."""
-        return self._rows.columns["visible"]
-
-    @property
-    def statistics(self) -> NDArray[np.uint16]:
-        """`(slots, yaws, pitches, 2)` least and mean depth, 65535 for the whole range."""
-        return self._rows.columns["statistics"]
-
-    def around(self, position: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-        """The slots around places; see `PlaceRows.around`."""
-        return self._rows.around(position)
-
-    def _compute(self, feet: NDArray[np.floating]) -> dict[str, NDArray]:
-        eye = feet + [0.0, self.key.sensor_height_m, 0.0]
-        centres = self._simulator.area.centres
-        # A place is less than a lattice diagonal away from its points, so that cells a little out of range count too.
-        reach = self.key.max_range_m + 2 * self.key.spacing_m
-        visible = seen_bits(self._simulator, eye, centres, reach_m=reach, tolerance_m=self.key.tolerance_m)
-        return {"visible": visible, "statistics": self._statistics_from(eye)}
-
-    def _statistics_from(self, eye: NDArray[np.floating]) -> NDArray[np.uint16]:
-        origin = np.repeat(eye, len(self._directions), axis=0)
-        distance = self._simulator.distance(origin, np.tile(self._directions, (len(eye), 1)))
-        around = distance.reshape(len(eye), panorama.AZIMUTHS, panorama.ELEVATIONS)
-        return panorama.view_statistics(around, self._samples, self.key.max_range_m)
-
-
-_shared: weakref.WeakKeyDictionary[SingleRays, dict[ViewKey, SceneTables]] = weakref.WeakKeyDictionary()
-
-
-def scene_tables(simulator: SingleRays, settings: TaskSettings) -> SceneTables:
-    """The tables for a scene and a task; tasks on the same open simulator share them."""
-    key = ViewKey(
-        sensor_height_m=settings.sensor_height_m,
-        intrinsics=settings.intrinsics,
-        pitch_limit_deg=settings.pitch_limit_deg,
-        max_range_m=settings.max_range_m,
-        tolerance_m=settings.tolerance_m,
-    )
-    known = _shared.setdefault(simulator, {})
+    Args:
+        simulator: which the result must not hold.
+        key: what is made, and all that it depends on besides the simulator.
+        make: makes it.
+    """
+    known = _kept.setdefault(simulator, {})
     if key not in known:
-        known[key] = SceneTables(simulator, key)
+        known[key] = make()
     return known[key]
+
+
+def pitches(settings: TaskSettings) -> tuple[float, ...]:
+    """Pitches of the statistics in radians: multiples of 10° up to the limit, and one beyond unless it is one."""
+    most = int(np.ceil(settings.pitch_limit_deg / panorama.PITCH_STEP_DEG - 1e-9))
+    return tuple(np.radians(panorama.PITCH_STEP_DEG * np.arange(-most, most + 1)).tolist())
+
+
+def scene_tables(simulator: SingleRays, settings: TaskSettings) -> PlaceTable:
+    """The tables for a scene and a task; tasks on the same open simulator share them.
+
+    Returns:
+        Columns `visible`, `(slots, words)` bit sets of the cells seen from each place, and `statistics`, `(slots,
+        yaws, pitches, 2)` least and mean depth, 65535 for the whole range.
+    """
+    key = ("cells", *_numbers(settings))
+    return once_per_simulator(simulator, key, lambda: make_scene_tables(simulator, settings))
+
+
+def _numbers(settings: TaskSettings) -> tuple[Any, ...]:
+    """What the tables depend on besides the scene."""
+    camera = settings.sensor_height_m, astuple(settings.intrinsics), settings.pitch_limit_deg
+    return *camera, settings.max_range_m, settings.tolerance_m, SPACING_M
+
+
+def make_scene_tables(simulator: SingleRays, settings: TaskSettings) -> PlaceTable:
+    """Tables as `scene_tables` gives them, shared with nobody."""
+    # Bits stand for cells: another NavMesh of the same scene has others.
+    cells = simulator.area.centres
+    name = hashlib.sha256(cells.tobytes() + f"{simulator.scene_digest} {_VERSION} {_numbers(settings)}".encode())
+    samples = panorama.view_samples(settings.intrinsics, pitches(settings))
+    empty = {"statistics": np.zeros((0, panorama.YAWS, len(pitches(settings)), 2), dtype=np.uint16)}
+
+    def statistics(rays: SingleRays, eye: Float) -> Columns:
+        return {"statistics": panorama.view_statistics(panorama.look_around(rays, eye), samples, settings.max_range_m)}
+
+    return point_table(simulator, settings, cells, name.hexdigest(), empty, statistics)
+
+
+def point_table(
+    simulator: SingleRays,
+    settings: TaskSettings,
+    points: Float,
+    digest: str,
+    empty: Columns | None = None,
+    further: Callable[[SingleRays, Float], Columns] = lambda rays, eye: {},
+) -> PlaceTable:
+    """A table whose column `visible` holds the bit sets of the points seen from each place.
+
+    Args:
+        simulator: casts the rays.
+        settings: of the task.
+        points: `(m, 3)` metres.
+        digest: of all that the columns follow from, hexadecimal.
+        empty: further columns by name, without rows.
+        further: those columns, of a simulator and `(k, 3)` places of cameras in metres.
+    """
+    # Not held: the table lives as long as the simulator, whose users hold it.
+    rays: SingleRays = weakref.proxy(simulator)
+    # A place is less than a lattice diagonal away from its points, so that points a little out of range count too.
+    reach_m, tolerance_m = settings.max_range_m + 2 * SPACING_M, settings.tolerance_m
+
+    def compute(feet: Float) -> Columns:
+        eye = feet + [0.0, settings.sensor_height_m, 0.0]
+        return {"visible": seen_bits(rays, eye, points, reach_m=reach_m, tolerance_m=tolerance_m), **further(rays, eye)}
+
+    columns = {"visible": np.zeros((0, words_for(len(points))), dtype=np.uint64), **(empty or {})}
+    return PlaceTable(Lattice(simulator.area, SPACING_M), digest[:32], columns, compute)

@@ -2,9 +2,9 @@
 
 A held-out pixel is *seen* by a frame when the point of its surface projects into the frame's image, in front of the
 camera, and the frame's depth there is that point's depth within `max(TOLERANCE_M, TOLERANCE_SHARE * depth)`. Depth is
-read between pixels as `coverage` does: inverse depth is linear over the image of a plane, so no slope widens the
-tolerance. Of the tolerances tried, from 5 mm to 5 cm, this one came closest to occlusion rays (within 0.5 % of the
-pixels in cluttered rooms): a wider one sees through cloth, books and panels, a narrower one loses curved surfaces.
+read between pixels (`rules.inverse_depths`), so that no slope widens the tolerance. Of the tolerances tried, from 5 mm
+to 5 cm, this one came closest to occlusion rays (within 0.5 % of the pixels in cluttered rooms): a wider one sees
+through cloth, books and panels, a narrower one loses curved surfaces.
 
 Reconstruction cannot show what no frame has seen, so the share of seen pixels predicts its quality before any training.
 """
@@ -15,8 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.poses import Intrinsics, in_image, pixel_directions, project
-from avp_habitat.sight.coverage import bilinear
+from avp_habitat.compiled import njit
+from avp_habitat.metrics import ALIKE_DEG, ALIKE_DISTANCE, PARALLAX_DEG
+from avp_habitat.poses import Intrinsics, pixel_directions
+from avp_habitat.sight.rules import camera_numbers, in_camera, in_image, inverse_depths
 
 Float = NDArray[np.floating]
 DepthView = tuple[Float, Float]
@@ -28,14 +30,7 @@ TOLERANCE_SHARE = 0.005
 """Or this close as a share of the depth, whichever is more."""
 PIXELS_PER_VIEW = 1200
 """About so many pixels of each held-out view are tested by default: every 16th row and column of 640x480."""
-ALIKE_DEG = 60.0
-"""A frame sees a surface as the held-out view does when its ray is turned by no more than this, degrees."""
-ALIKE_DISTANCE = 2.0
-"""And when it stands no more than this many times as far away."""
-PARALLAX_DEG = 10.0
-"""Rays this far apart show how far away a surface is, degrees."""
 
-_BLOCK = 1 << 17
 # Multiples of these, without their whole parts, fill the unit square evenly: the powers of 1 / 1.3247…, the root of
 # x³ = x + 1 (the R2 sequence).
 _SPREAD = np.array([0.7548776662466927, 0.5698402909980532])
@@ -144,9 +139,6 @@ def heldout_points(views: Iterable[DepthView], intrinsics: Intrinsics, *, stride
 def points_seen(depth: Float, camera_to_world: Float, intrinsics: Intrinsics, points: Float) -> NDArray[np.int64]:
     """Which points a frame sees.
 
-    The depth is read between pixels, which is exact on planes. Where the four neighbours belong to different surfaces
-    the interpolated value belongs to none, so the nearest pixel's answer counts as well.
-
     Args:
         depth: `(height, width)` planar depth in metres, 0 where nothing was hit.
         camera_to_world: `(4, 4)` habitat pose.
@@ -156,25 +148,22 @@ def points_seen(depth: Float, camera_to_world: Float, intrinsics: Intrinsics, po
     Returns:
         `(k,)` their indices, ascending.
     """
-    depth = np.asarray(depth)
-    inverse = np.divide(1.0, depth, out=np.zeros(depth.shape, np.float32), where=depth > 0)
-    blocks = [_seen(inverse, camera_to_world, intrinsics, points[start : start + _BLOCK]) + start
-              for start in range(0, len(points), _BLOCK)]  # fmt: skip
-    return np.concatenate([np.zeros(0, np.int64), *blocks])
+    pose, camera = np.ascontiguousarray(camera_to_world, np.float64), camera_numbers(intrinsics)
+    return np.flatnonzero(_points_seen(np.ascontiguousarray(depth), pose, camera, points))
 
 
-def _seen(inverse: Float, camera_to_world: Float, intrinsics: Intrinsics, points: Float) -> NDArray[np.int64]:
-    pixel, depth = project(points, camera_to_world[None], intrinsics)
-    (u, v), planar = pixel[0].T, depth[0]
-    index = np.flatnonzero(in_image(pixel[0], planar, intrinsics))
-    u, v, planar = u[index], v[index], planar[index]
-    # |d - z| <= t in inverse depth; 1/d is at most 1/(z - t), unbounded where the camera is that near.
-    tolerance = np.maximum(TOLERANCE_M, TOLERANCE_SHARE * planar)
-    least, most = 1.0 / (planar + tolerance), 1.0 / np.maximum(planar - tolerance, 1e-6)
-    nearest = inverse[v.astype(np.int64), u.astype(np.int64)]
-    between = bilinear(inverse[None], np.zeros(len(index), np.int64), u - 0.5, v - 0.5)
-    agrees = [(least <= value) & (value <= most) for value in (nearest, between)]
-    return index[agrees[0] | agrees[1]]
+@njit(cache=True)
+def _points_seen(depth, pose, camera, points):
+    seen = np.zeros(len(points), np.bool_)
+    for j in range(len(points)):
+        right, up, ahead = in_camera(pose, points[j])
+        if in_image(right, up, ahead, camera):
+            # |d - z| <= t in inverse depth; 1/d is at most 1/(z - t), unbounded where the camera is that near.
+            tolerance = max(TOLERANCE_M, TOLERANCE_SHARE * ahead)
+            least, most = 1.0 / (ahead + tolerance), 1.0 / max(ahead - tolerance, 1e-6)
+            between, nearest = inverse_depths(depth, right, up, ahead, camera)
+            seen[j] = least <= between <= most or least <= nearest <= most
+    return seen
 
 
 def visibility(points: HeldoutPoints, frames: Iterable[DepthView], intrinsics: Intrinsics) -> Visibility:

@@ -54,7 +54,7 @@ class Simulator(Protocol):
         *,
         tolerance_m: float,
     ) -> NDArray[np.bool_]:
-        """Whether cameras see points: inside the image (`poses.in_image`), and reached by the ray through it.
+        """Whether cameras see points: inside the image (`sight.rules.in_image`), and reached by the ray through it.
 
         Args:
             camera_to_world: `(n, 4, 4)` habitat poses.

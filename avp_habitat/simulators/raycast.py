@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.poses import Intrinsics, pixel_directions
-from avp_habitat.sight.coverage import pairs_in_image
+from avp_habitat.sight.rules import pairs_in_image
 from avp_habitat.simulators.base import Frames
 
 if TYPE_CHECKING:

@@ -111,24 +111,6 @@ class SimulatorChoice:
         return None
 
 
-def add_simulator_options(parser: Any) -> None:
-    """Until all commands are read by tyro."""
-    parser.add_argument("--simulator", default="raycast")
-    parser.add_argument("--gpu", default=None, type=int)
-    parser.add_argument("--navmesh", default=None, type=Path)
-    add_up_option(parser)
-
-
-def add_up_option(parser: Any) -> None:
-    """Until all commands are read by tyro."""
-    parser.add_argument("--up", choices=UPS)
-
-
-def simulator_choice(options: Any) -> SimulatorChoice:
-    """Until all commands are read by tyro."""
-    return SimulatorChoice(options.simulator, options.gpu, options.navmesh, options.up)
-
-
 def _takes(factory: Factory, option: str) -> bool:
     parameters = inspect.signature(factory).parameters.values()
     return any(each.name == option or each.kind is each.VAR_KEYWORD for each in parameters)

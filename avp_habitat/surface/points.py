@@ -1,6 +1,5 @@
-"""The surface of a scene as points with normals, and how well a view from somewhere shows them."""
+"""The surface of a scene as points with normals."""
 
-import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -9,17 +8,14 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics, unproject
+from avp_habitat.sight.rules import view_quality
+from avp_habitat.sight.tables import once_per_simulator
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.task.motion import sensor_poses
 from avp_habitat.task.settings import TaskSettings
 
-Float = NDArray[np.floating]
-
 EDGE_M = 0.25
 """One point for each cube of this edge and each of six directions that surface in it faces, metres."""
-FULL_DISTANCE_M = 2.0
-"""d₀: a surface seen straight on from this near, or nearer, is seen with quality 1, metres."""
-
 _PLACES = 60
 _YAWS_DEG = (0.0, 90.0, 180.0, 270.0)
 _PITCHES_DEG = (-45.0, 0.0, 45.0)
@@ -27,7 +23,6 @@ _CAMERA = Intrinsics.from_hfov(96, 72, hfov_deg=100.0)
 _FLAT_SHARE = 0.002
 """A pixel has a normal where its four neighbours lie this close to its plane, as a share of its distance: the rounded
 normals of edges and corners would else count as surfaces that face a direction of their own."""
-
 _BEFORE_M = 0.01
 
 
@@ -73,27 +68,6 @@ def views_all_over(simulator: Simulator, settings: TaskSettings) -> Iterator[Vie
             yield View(place, each, np.asarray(unproject(image, each, _CAMERA), dtype=np.float64), hit)
 
 
-def view_quality(eye: Float, points: Float, normals: Float) -> NDArray[np.float64]:
-    """How well surface points are seen from a place: cos(ray, normal) · min(1, d₀ / distance), 0 from behind.
-
-    Args:
-        eye: `(..., 3)` metres.
-        points: `(..., 3)` metres.
-        normals: `(..., 3)` unit vectors.
-
-    Returns:
-        `(...)` within [0, 1], wherever the point lies in the image and whatever lies between.
-    """
-    offset = eye - points
-    distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-9)
-    cosine = (offset * normals).sum(axis=-1) / distance
-    quality = np.clip(cosine, 0.0, 1.0) * np.minimum(1.0, FULL_DISTANCE_M / distance)
-    return np.asarray(quality, dtype=np.float64)
-
-
-_known: weakref.WeakKeyDictionary[Simulator, dict[tuple[float, float], SceneSurface]] = weakref.WeakKeyDictionary()
-
-
 def scene_surface(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
     """The surface of a scene; found once for an open simulator.
 
@@ -102,11 +76,8 @@ def scene_surface(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
     Raises:
         UsageError: the scene shows no surface at all.
     """
-    known = _known.setdefault(simulator, {})
-    key = (settings.sensor_height_m, settings.max_range_m)
-    if key not in known:
-        known[key] = _find(simulator, settings)
-    return known[key]
+    key = ("surface", settings.sensor_height_m, settings.max_range_m)
+    return once_per_simulator(simulator, key, lambda: _find(simulator, settings))
 
 
 def _find(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
@@ -115,7 +86,7 @@ def _find(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
         eye = view.camera_to_world[:3, 3]
         normals, flat = _normals(view, eye)
         points, normals = view.points[flat], normals[flat]
-        found.append(_best(np.column_stack([points, normals, view_quality(eye, points, normals)])))
+        found.append(_best(np.column_stack([points, normals, view_quality(eye[None], points, normals)[0]])))
     rows = _best(np.concatenate(found))
     if not len(rows):
         raise UsageError(

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.compiled import njit
 from avp_habitat.poses import Intrinsics, pixel_directions
-from avp_habitat.sight.coverage import candidates
+from avp_habitat.sight.rules import candidates
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.task.settings import TaskSettings
 from avp_habitat.task.views import Float, Shown, Views, depth_statistics

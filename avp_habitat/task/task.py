@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from avp_habitat import poses
 from avp_habitat.simulators.base import Simulator
-from avp_habitat.surface.memory import RoomSurface, room_surfaces
+from avp_habitat.surface.memory import RoomSurface
 from avp_habitat.task import motion
 from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.cast import CastSensor
@@ -54,9 +54,8 @@ class _Room:
     simulator: Simulator
     sensor: Sensor
     floor: MapObserver
-    cells: int
-    rows: Rows
     surface: RoomSurface | None
+    rows: Rows
 
 
 class ViewpointTask:
@@ -81,22 +80,10 @@ class ViewpointTask:
         """The kind of observation; its `space` is of one agent."""
         self._everyone = np.arange(agents)
         self._room_of = self._everyone % len(scenes)
-        scenes = scenes[:agents]
-        surfaces = room_surfaces(scenes, settings, self._room_of)
-        self._rooms = [
-            _Room(
-                scene,
-                TableSensor(scene, settings) if settings.lookup else CastSensor(scene, settings),
-                MapObserver(scene.area),
-                len(scene.area.centres),
-                np.flatnonzero(self._room_of == index),
-                surface,
-            )
-            for index, (scene, surface) in enumerate(zip(scenes, surfaces, strict=True))
-        ]
-        self._cells = np.array([self._rooms[index].cells for index in self._room_of])
-        self._diameter = np.array([self._rooms[index].simulator.area.diameter_m for index in self._room_of])
-        budget = settings.budget
+        self._rooms = [self._room(scene, index) for index, scene in enumerate(scenes[:agents])]
+        areas = [self._rooms[index].simulator.area for index in self._room_of]
+        self._cells = np.array([len(area.centres) for area in areas])
+        self._diameter = np.array([area.diameter_m for area in areas])
         self.steps = np.zeros(agents, dtype=np.int64)
         self.position = np.zeros((agents, 3))
         self.yaw = np.zeros(agents)
@@ -105,14 +92,19 @@ class ViewpointTask:
         self._observed = np.zeros(agents, dtype=np.int64)
         self._collided = np.zeros(agents, dtype=np.bool_)
         # Row 0 is the start, row t the state after step t.
-        self._path = np.zeros((agents, budget + 1, 3))
-        self._angles = np.zeros((agents, budget + 1, 2))
-        self._cell = np.zeros((agents, budget + 1, 2), dtype=np.int64)
-        self._log = {
-            name: np.zeros((agents, budget)) for name in ("action", "reward", "coverage", "collided", "redundant")
-        }
+        self._path = np.zeros((agents, settings.budget + 1, 3))
+        self._angles = np.zeros((agents, settings.budget + 1, 2))
+        self._cell = np.zeros((agents, settings.budget + 1, 2), dtype=np.int64)
+        logged = ("action", "reward", "coverage", "collided", "redundant")
+        self._log = {name: np.zeros((agents, settings.budget)) for name in logged}
         # By the names that the reward gives them, from the first step that has them; zero in all others.
         self._parts: dict[str, NDArray[np.float64]] = {}
+
+    def _room(self, scene: Simulator, index: int) -> _Room:
+        settings, rows = self.settings, np.flatnonzero(self._room_of == index)
+        sensor = TableSensor(scene, settings) if settings.lookup else CastSensor(scene, settings)
+        surface = RoomSurface(scene, settings, self.agents, rows) if settings.with_surface else None
+        return _Room(scene, sensor, MapObserver(scene.area), surface, rows)
 
     def simulator(self, row: int) -> Simulator:
         """The simulator of one agent's scene."""

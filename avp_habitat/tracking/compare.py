@@ -16,21 +16,20 @@ from tyro.conf import UseAppendAction, arg
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
-from avp_habitat.files import NewFolder
-from avp_habitat.metrics import FIGURES, coverage_per_view, explained, mean_and_half_width
-from avp_habitat.tables import table
-from avp_habitat.tracking.experiments import DEFAULT_HELP, chosen_experiment, find_experiment
-from avp_habitat.tracking.names import (
-    COMPARISON,
-    EVALUATION,
-    KIND_TAG,
-    MAX_TAG,
-    METHOD_TAG,
-    NOTE_TAG,
-    POLICY_TAG,
-    ROLLOUT_RUN_TAG,
-    SCENE_TAG,
+from avp_habitat.files import atomic_folder, check_new
+from avp_habitat.metrics import (
+    FIGURES,
+    METRICS_HELP,
+    Figure,
+    coverage_per_view,
+    explained,
+    figures,
+    find_metrics,
+    mean_and_half_width,
 )
+from avp_habitat.tables import table
+from avp_habitat.tracking import names
+from avp_habitat.tracking.experiments import DEFAULT_HELP, chosen_experiment, find_experiment
 from avp_habitat.tracking.stores import (
     ADDRESS_HELP,
     DEFAULT_ADDRESS,
@@ -48,9 +47,7 @@ if TYPE_CHECKING:
     from mlflow.entities import Experiment
 
 TABLE, MARKDOWN, PICTURE = "comparison.json", "comparison.md", "comparison.png"
-_SHOWN = [FIGURES[name] for name in ("views", "coverage", "cpv", "visibility", "psnr", "ssim", "lpips")]
-COLUMNS = ("policy", "scene", "method", "runs", *(figure.heading for figure in _SHOWN))
-"""Of the table."""
+_ALWAYS = [FIGURES[name] for name in ("views", "coverage", "cpv", "visibility", "psnr", "ssim", "lpips")]
 _MOST_RUNS = 50_000  # that MLflow gives in one answer
 _HOW_TO_READ = f"""
 More PSNR and SSIM are better, less LPIPS; fewer views are better. Means over the runs; ± is half of the 95 % interval.
@@ -64,54 +61,57 @@ class Method:
     """One row: the runs of a policy in a scene, by one method."""
 
     policy: str
-    """Who took the views."""
     scene: str
-    """Where."""
     method: str
-    """nerfstudio's method, or `evaluation`."""
     runs: int
-    """How many."""
     means: Mapping[str, float]
     """By name of the figure; what no run has is missing."""
     halves: Mapping[str, float]
     """Half of the 95 % interval, where more than one run or episode tells of the spread."""
+    further: tuple[Figure, ...] = ()
+    """A user's metrics among them."""
 
-    def cells(self) -> list[str]:
-        """As `COLUMNS` says."""
-        halves = {figure.name: self.halves.get(figure.name, math.nan) for figure in _SHOWN}
-        known = self.means
-        figures = [one.text(known[one.name], halves[one.name]) if one.name in known else "–" for one in _SHOWN]
-        return [self.policy, self.scene, self.method, str(self.runs), *figures]
+    def cells(self, shown: Sequence[Figure]) -> list[str]:
+        """The row, with these figures."""
+        known, halves = self.means, self.halves
+        texts = [
+            one.text(known[one.name], halves.get(one.name, math.nan)) if one.name in known else "–" for one in shown
+        ]
+        return [self.policy, self.scene, self.method, str(self.runs), *texts]
 
 
-def compare(client: "MlflowClient", experiment_id: str) -> list[Method]:
+def compare(client: "MlflowClient", experiment_id: str, metrics: Sequence[str] = ()) -> list[Method]:
     """What an experiment's reconstructions, rollouts and evaluations (of its first 50,000 runs) say of each method.
 
     Args:
         client: of the store.
         experiment_id: where to look.
+        metrics: of the user, for those that no distribution registers.
 
     Returns:
         Rows by scene; within it those with a reconstruction first, the best PSNR at the top, then by coverage.
     """
+    known = figures(metrics)
     found = client.search_runs([experiment_id], "metrics.`eval/coverage` >= 0", max_results=_MOST_RUNS)
     # A reconstruction carries the figures of its rollout, which would otherwise count twice.
-    rollouts = {run.data.tags.get(ROLLOUT_RUN_TAG) for run in found}
+    rollouts = {run.data.tags.get(names.ROLLOUT_RUN_TAG) for run in found}
     groups: dict[tuple[str, str, str], list[dict[str, float]]] = defaultdict(list)
     for run in found:
-        metrics = {name: value for name, value in run.data.metrics.items() if math.isfinite(value)}
+        logged = {name: value for name, value in run.data.metrics.items() if math.isfinite(value)}
         tags = run.data.tags
         # A run without a policy is that of a training with evaluations in between.
-        told = tags.get(POLICY_TAG) and {"eval/coverage", "eval/views"} <= metrics.keys()
-        if told and tags.get(KIND_TAG) != COMPARISON and run.info.run_id not in rollouts:
-            method = tags.get(METHOD_TAG) or tags.get(KIND_TAG) or EVALUATION
-            groups[tags[POLICY_TAG], tags.get(SCENE_TAG, "?"), method].append(metrics)
-    return sorted((_method(*key, group) for key, group in groups.items()), key=_rank)
+        told = tags.get(names.POLICY_TAG) and {"eval/coverage", "eval/views"} <= logged.keys()
+        if told and tags.get(names.KIND_TAG) != names.COMPARISON and run.info.run_id not in rollouts:
+            method = tags.get(names.METHOD_TAG) or tags.get(names.KIND_TAG) or names.EVALUATION
+            groups[tags[names.POLICY_TAG], tags.get(names.SCENE_TAG, "?"), method].append(logged)
+    return sorted((_method(*key, group, known) for key, group in groups.items()), key=_rank)
 
 
-def _method(policy: str, scene: str, method: str, runs: Sequence[Mapping[str, float]]) -> Method:
+def _method(
+    policy: str, scene: str, method: str, runs: Sequence[Mapping[str, float]], known: Mapping[str, Figure]
+) -> Method:
     means, halves = {}, {}
-    for name in (figure.name for figure in _SHOWN):
+    for name in [figure.name for figure in _ALWAYS] + [name for name in known if name not in FIGURES]:
         values = [run[f"eval/{name}"] for run in runs if f"eval/{name}" in run]
         if values:
             mean, half = mean_and_half_width(values)
@@ -120,7 +120,8 @@ def _method(policy: str, scene: str, method: str, runs: Sequence[Mapping[str, fl
             halves[name] = float(half) if len(values) > 1 else runs[0].get(f"eval/{name}_ci95", math.nan)
     coverages, views = ([run[name] for run in runs] for name in ("eval/coverage", "eval/views"))
     means["cpv"] = coverage_per_view(coverages, views)  # type: ignore[arg-type]
-    return Method(policy, scene, method, len(runs), means, {**halves, "cpv": math.nan})
+    further = tuple(figure for name, figure in known.items() if name not in FIGURES and name in means)
+    return Method(policy, scene, method, len(runs), means, {**halves, "cpv": math.nan}, further)
 
 
 def _rank(method: Method) -> tuple[Any, ...]:
@@ -128,19 +129,26 @@ def _rank(method: Method) -> tuple[Any, ...]:
     return method.scene, -psnr, -method.means["coverage"], method.policy, method.method
 
 
+def rows(methods: Sequence[Method]) -> tuple[list[str], list[list[str]]]:
+    """Head and rows of the table; a user's metric has a column where a run has it."""
+    shown = list(dict.fromkeys([*_ALWAYS, *(figure for method in methods for figure in method.further)]))
+    head = ["policy", "scene", "method", "runs", *(figure.heading for figure in shown)]
+    return head, [method.cells(shown) for method in methods]
+
+
 def markdown(methods: Sequence[Method]) -> str:
     """The table."""
-    return table(COLUMNS, [method.cells() for method in methods]) + "\n"
+    return table(*rows(methods)) + "\n"
 
 
 def picture(methods: Sequence[Method], path: Path) -> bool:
     """Draw PSNR against views, one point per method; False where none has a reconstruction."""
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Drawing
 
     drawn = [method for method in methods if "psnr" in method.means]
     if not drawn:
         return False
-    drawing = Figure(figsize=(6.4, 4), layout="constrained")
+    drawing = Drawing(figsize=(6.4, 4), layout="constrained")
     axes = drawing.subplots()
     for method in drawn:
         # What tells a row from the others.
@@ -161,26 +169,21 @@ def picture(methods: Sequence[Method], path: Path) -> bool:
 
 
 def keep(client: "MlflowClient", experiment_id: str, methods: Sequence[Method]) -> str:
-    """Make or renew the run that compares these methods; there is one for each set of scenes.
-
-    Args:
-        client: of the store.
-        experiment_id: where the run lies.
-        methods: at least one.
+    """Make or renew the run that compares these methods, one for each set of scenes; its id.
 
     Raises:
         MlflowException: the store refuses.
-
-    Returns:
-        The run's id.
     """
-    tags = {KIND_TAG: COMPARISON, SCENE_TAG: ", ".join(sorted({method.scene for method in methods}))[:MAX_TAG]}
-    of_kind = client.search_runs([experiment_id], f"tags.`{KIND_TAG}` = '{COMPARISON}'")
-    kept = [run for run in of_kind if run.data.tags.get(SCENE_TAG) == tags[SCENE_TAG]]
-    run = kept[0] if kept else client.create_run(experiment_id, run_name=COMPARISON, tags=tags)
+    tags = {
+        names.KIND_TAG: names.COMPARISON,
+        names.SCENE_TAG: ", ".join(sorted({method.scene for method in methods}))[: names.MAX_TAG],
+    }
+    of_kind = client.search_runs([experiment_id], f"tags.`{names.KIND_TAG}` = '{names.COMPARISON}'")
+    kept = [run for run in of_kind if run.data.tags.get(names.SCENE_TAG) == tags[names.SCENE_TAG]]
+    run = kept[0] if kept else client.create_run(experiment_id, run_name=names.COMPARISON, tags=tags)
     run_id = run.info.run_id
     try:
-        client.log_dict(run_id, {"columns": COLUMNS, "data": [method.cells() for method in methods]}, TABLE)
+        client.log_dict(run_id, dict(zip(("columns", "data"), rows(methods), strict=True)), TABLE)
         # As `log_table` does, which would append to a table that is there.
         client.set_tag(run_id, "mlflow.loggedArtifacts", json.dumps([{"path": TABLE, "type": "table"}]))
         with tempfile.TemporaryDirectory() as folder:
@@ -188,7 +191,7 @@ def keep(client: "MlflowClient", experiment_id: str, methods: Sequence[Method]) 
             for path in Path(folder).iterdir():
                 client.log_artifact(run_id, os.fspath(path))
         # The page shows it above everything else.
-        client.set_tag(run_id, NOTE_TAG, (markdown(methods) + _HOW_TO_READ)[:MAX_TAG])
+        client.set_tag(run_id, names.NOTE_TAG, (markdown(methods) + _HOW_TO_READ)[: names.MAX_TAG])
     finally:
         client.set_terminated(run_id)
     return run_id
@@ -210,11 +213,13 @@ class Compare:
     mlflow: Annotated[str, arg(help=ADDRESS_HELP)] = "auto"
     scene: UseAppendAction[tuple[str, ...]] = ()
     """Only this scene; give it again for more."""
+    metrics: Annotated[tuple[str, ...], arg(help=f"{METRICS_HELP}; registered ones are shown without")] = ()
     out: Path | None = None
     """Write table and picture to this folder, too; must not exist."""
 
     def __post_init__(self) -> None:
-        """Refuse no place."""
+        """Refuse no place, and metrics that there are not."""
+        find_metrics(self.metrics)
         if self.mlflow == "off":
             raise UsageError("mlflow: expected an address or auto, got off: it is MLflow's runs that are compared")
 
@@ -224,7 +229,8 @@ def main(options: Compare) -> None:
     from mlflow.exceptions import MlflowException
 
     address = str(address_of(options.mlflow, default=DEFAULT_ADDRESS))
-    folder = None if options.out is None else NewFolder(options.out, failure=UsageError)
+    if options.out is not None:
+        check_new(options.out, option="--out")
     client = connect(address)
     try:
         experiment = _experiment(client, options.experiment)
@@ -234,10 +240,10 @@ def main(options: Compare) -> None:
         prepare_experiment(client, experiment.experiment_id)
     except MlflowException as error:
         raise TrackingError(f"MLflow at {shown(address)} does not answer: {first_line(error)}") from None
-    if folder is not None:
-        with folder:
-            _write(folder.path("."), methods)
-            print(f"files:   {folder.publish()}")
+    if options.out is not None:
+        with atomic_folder(options.out, failure=UsageError, option="--out") as folder:
+            _write(folder, methods)
+        print(f"files:   {options.out}")
     page = f"#/experiments/{experiment.experiment_id}/runs/{run}?{MODEL_TRAINING}"
     served = urlsplit(address).scheme in ("http", "https")
     there = f"{how_to_look(address).rstrip('/')}/" if served else f"{how_to_look(address)}, then http://127.0.0.1:5000/"
@@ -255,7 +261,7 @@ def _experiment(client: "MlflowClient", option: str | None) -> "Experiment":
 
 
 def _methods(client: "MlflowClient", experiment: "Experiment", options: Compare) -> list[Method]:
-    methods = compare(client, experiment.experiment_id)
+    methods = compare(client, experiment.experiment_id, options.metrics)
     if not methods:
         raise AVPError(
             f"experiment {experiment.name!r} at {shown(client.tracking_uri)} has no run with eval/coverage, eval/views "

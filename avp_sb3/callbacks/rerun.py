@@ -8,7 +8,7 @@ import socket
 import sys
 import sysconfig
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 from datetime import datetime
 from numbers import Real
 from pathlib import Path
@@ -28,11 +28,12 @@ from avp_sb3.rerun.episode import episode_of, log_episode, metric_path
 from avp_sb3.rerun.layout import eye_above, training_blueprint
 from avp_sb3.rerun.room import log_room
 
-DEFAULT_FOLDER = Path("runs")
 _FLUSH_S = 5.0
 _LEAST_FREE = 100_000_000
 _LOOPBACK = "127.0.0.1"
 _FIGURE_ROWS, _FIGURE_SECONDS = 512, 10.0
+_Figures = tuple[dict[str, int], Mapping[str, Any]]
+"""An episode's values of the time lines `episode`, `env_step` and, if it was recorded, `step`; its figures."""
 
 
 class RecordingError(AVPError):
@@ -114,15 +115,15 @@ class RerunCallback(BaseCallback):
         self._episodes = self._steps = self._largest = 0
         self._due, self._started, self._spent = 1, time.monotonic(), 0.0
         self._environments = RecordedEnvironments(self.training_env)
-        self._figures = _Figures()
+        self._kept, self._sent_at = list[_Figures](), time.monotonic()
         self._said: set[str] = set()
         self._shown: set[str] = set()
         areas = self._environments.areas
-        self._roots = {name: _root(name) if len(areas) > 1 else "" for name in areas}
-        self._eyes = {self._roots[name]: area and eye_above(area.centres) for name, area in areas.items()}
+        self._roots = {name: f"/{rr.escape_entity_path_part(name)}" if len(areas) > 1 else "" for name in areas}
+        eyes = {self._roots[name]: None if area is None else eye_above(area.centres) for name, area in areas.items()}
         self.path = self._next_path()
         # By default a process has one id, under which a viewer would merge the recordings of two trainings.
-        identity, layout = str(uuid4()), training_blueprint(self._eyes)
+        identity, layout = str(uuid4()), training_blueprint(eyes)
         self._recordings[str(self.path)] = _recording_in(self.path, identity, layout)
         # An interrupted training has no end that would finish the file.
         atexit.register(self.close)
@@ -142,10 +143,10 @@ class RerunCallback(BaseCallback):
             trajectory = required(info, "avp_trajectory", reader="RerunCallback")
             times = {"episode": self._episodes, "env_step": self.num_timesteps}
             if self._is_due():
-                self._timed_record(index, trajectory, times)
+                self._record(index, trajectory, times)
                 times["step"] = self._steps - 1
-            self._figures.add(info.get("avp_episode", {}), times)
-            if self._figures.due:
+            self._kept.append((times, info.get("avp_episode", {})))
+            if len(self._kept) >= _FIGURE_ROWS or time.monotonic() - self._sent_at > _FIGURE_SECONDS:
                 self._send_figures()
         return True
 
@@ -154,10 +155,10 @@ class RerunCallback(BaseCallback):
 
     def _finish(self) -> None:
         """Send what is kept and end the file; a viewer stays."""
-        if self.path is None or not self._recordings:
+        if not self._recordings:
             return
         self._send_figures()
-        if (recording := self._recordings.pop(str(self.path), None)) is not None:
+        if recording := self._recordings.pop(str(self.path), None):
             recording.disconnect()
             if self.verbose:
                 print(f"Rerun:    rerun {shlex.quote(str(self.path))}", flush=True)
@@ -168,21 +169,13 @@ class RerunCallback(BaseCallback):
         in_time = self._spent <= self._max_share * (time.monotonic() - self._started)
         return in_time and self._has_room(self._largest)
 
-    def _timed_record(self, index: int, trajectory: Any, times: Mapping[str, int]) -> None:
-        assert self.path is not None
-        began, size = time.monotonic(), self.path.stat().st_size
-        self._record(index, trajectory, times)
-        self._flush()
-        self._largest = max(self._largest, self.path.stat().st_size - size)
-        self._spent += time.monotonic() - began
-        self._due = self._episodes + self._every
-
     def _record(self, index: int, trajectory: Any, times: Mapping[str, int]) -> None:
+        began, size = time.monotonic(), self._file_size
         width, height = self._size
         camera = self._environments.camera(index, width=width, height=height)
         views = self._environments.pictures(index, trajectory, camera, at_most=self._pictures)
         episode = episode_of(trajectory, self._environments.area(index), camera, views)
-        root = self._root_of(self._environments.scene(index))
+        root = self._roots.get(self._environments.scene(index), "")
         is_new = root not in self._shown
         room = self._environments.room(index) if is_new else None
         if room is not None and not self._has_room(sum(array.nbytes for array in room)):
@@ -192,11 +185,18 @@ class RerunCallback(BaseCallback):
             if room is not None:
                 log_room(recording, f"{root}/world/room", room)
             log_episode(recording, root, episode, times=times, first_step=self._steps, with_scene=is_new)
+        self._flush()
         self._steps += len(trajectory.action)
+        self._largest = max(self._largest, self._file_size - size)
+        self._spent += time.monotonic() - began
+        self._due = self._episodes + self._every
 
     def _send_figures(self) -> None:
-        if self._has_room():
-            self._figures.send(self._recordings.values())
+        curves = list(_curves(self._kept)) if self._has_room() else []
+        for recording in self._recordings.values():
+            for path, times, values in curves:
+                recording.send_columns(path, times, rr.Scalars.columns(scalars=values))
+        self._kept, self._sent_at = [], time.monotonic()
         self._flush()
 
     def _flush(self) -> None:
@@ -209,24 +209,19 @@ class RerunCallback(BaseCallback):
                 self._failed.append(self._recordings.pop(name))
                 self._say(f"{name}: {error}; what came before is kept, the training goes on")
 
-    def _root_of(self, scene: str) -> str:
-        """The entity path of a scene; a scene that was not there at the start gets a place in the layout."""
-        if scene not in self._roots:
-            self._roots[scene] = _root(scene)
-            self._eyes[_root(scene)] = None
-            for recording in self._recordings.values():
-                recording.send_blueprint(training_blueprint(self._eyes))
-        return self._roots[scene]
-
     def _has_room(self, size: int = 0) -> bool:
         assert self.path is not None
-        if self.path.stat().st_size + size >= self._max_bytes:
+        if self._file_size + size >= self._max_bytes:
             self._say(f"{self.path}: has reached max_bytes ({self._max_bytes}); nothing further is recorded")
-            return False
-        if shutil.disk_usage(self.path.parent).free < size + _LEAST_FREE:
+        elif shutil.disk_usage(self.path.parent).free < size + _LEAST_FREE:
             self._say(f"{self.path}: the disk has less than {_LEAST_FREE / 1e6:.0f} MB left; nothing is recorded")
-            return False
-        return True
+        else:
+            return True
+        return False
+
+    @property
+    def _file_size(self) -> int:
+        return self.path.stat().st_size if self.path is not None and self.path.exists() else 0
 
     def _say(self, text: str) -> None:
         """A line on the error stream, once per training."""
@@ -235,45 +230,21 @@ class RerunCallback(BaseCallback):
             print(f"RerunCallback: {text}", file=sys.stderr)
 
     def _next_path(self) -> Path:
-        path = self._wanted_path or DEFAULT_FOLDER / f"avp-{datetime.now():%Y%m%d-%H%M%S}.rrd"
+        path = self._wanted_path or Path("runs") / f"avp-{datetime.now():%Y%m%d-%H%M%S}.rrd"
         if self._trainings > 1 and self._wanted_path is not None:
             path = path.with_stem(f"{path.stem}-{self._trainings}")
         return path
 
 
-class _Figures:
-    """The figures of finished episodes, kept back and sent many at a time."""
-
-    def __init__(self) -> None:
-        self._rows: list[tuple[Mapping[str, int], dict[str, float]]] = []
-        self._sent_at = time.monotonic()
-
-    def add(self, figures: Mapping[str, object], times: Mapping[str, int]) -> None:
-        """Keep the figures that are numbers; `times` are `episode`, `env_step`, and `step` of a recorded episode."""
-        numbers = {name: float(value) for name, value in figures.items() if isinstance(value, Real)}
-        self._rows.append((times, numbers))
-
-    @property
-    def due(self) -> bool:
-        """Whether sending is worth its time: many episodes are kept, or the last sending was a while ago."""
-        return len(self._rows) >= _FIGURE_ROWS or time.monotonic() - self._sent_at > _FIGURE_SECONDS
-
-    def send(self, recordings: Iterable[rr.RecordingStream]) -> None:
-        """Add what is kept to recordings, and forget it."""
-        for lines in {tuple(times) for times, _ in self._rows}:
-            rows = [(times, figures) for times, figures in self._rows if tuple(times) == lines]
-            for name in dict.fromkeys(name for _, figures in rows for name in figures):
-                having = [(times, figures[name]) for times, figures in rows if name in figures]
-                columns = [rr.TimeColumn(line, sequence=[times[line] for times, _ in having]) for line in lines]
-                scalars = rr.Scalars.columns(scalars=[value for _, value in having])
-                for recording in recordings:
-                    recording.send_columns(metric_path("", name), columns, scalars)
-        self._rows.clear()
-        self._sent_at = time.monotonic()
-
-
-def _root(scene: str) -> str:
-    return f"/{rr.escape_entity_path_part(scene)}"
+def _curves(kept: list[_Figures]) -> Iterator[tuple[str, list[rr.TimeColumn], list[float]]]:
+    """Entity, times and values of each figure, apart for the episodes that have a `step` and those that have none."""
+    for lines in dict.fromkeys(tuple(times) for times, _ in kept):
+        rows = [(times, figures) for times, figures in kept if tuple(times) == lines]
+        values = [item for _, figures in rows for item in figures.items()]
+        for name in dict.fromkeys(name for name, value in values if isinstance(value, Real)):
+            having = [(times, figures[name]) for times, figures in rows if name in figures]
+            columns = [rr.TimeColumn(line, sequence=[times[line] for times, _ in having]) for line in lines]
+            yield metric_path("", name), columns, [value for _, value in having]
 
 
 def _recording_in(path: Path, identity: str, layout: rr.blueprint.Blueprint) -> rr.RecordingStream:

@@ -12,14 +12,12 @@ from avp_sb3.rerun.room import Cloud, room_points
 
 if TYPE_CHECKING:
     from avp_habitat.navigation.area import NavigableArea
-    from avp_habitat.simulators.base import Frames
     from avp_habitat.task.trajectory import Trajectory
 
 _HFOV_DEG, _SENSOR_HEIGHT_M = 90.0, 1.5
 _ROOM_WIDTH, _ROOM_HEIGHT = 72, 54
 _CANDIDATES, _YAWS, _PITCH_DEG = 512, 3, -20.0
-_TURN = 0.382
-"""Of a full turn from place to place, so that no two look the same ways."""
+_TURN = 0.382  # of a full one from place to place, so that no two look the same ways
 
 
 class RecordedEnvironments:
@@ -29,15 +27,12 @@ class RecordedEnvironments:
         """Ask which attributes they have."""
         self._env = env
         self._has = {name: env.has_attr(name) for name in ("area", "capture", "scene_name", "settings")}
-
-    @property
-    def missing(self) -> list[str]:
+        self.missing = [name for name in ("area", "capture") if not self._has[name]]
         """Those of `area` and `capture` that the environments lack."""
-        return [name for name in ("area", "capture") if not self._has[name]]
 
     @property
     def areas(self) -> "dict[str, NavigableArea | None]":
-        """Where agents can stand, by the name of the scene, each once; one empty name where environments do not tell."""
+        """Where agents can stand, by the scene's name, each once; one empty name where none is told."""
         names: list[str] = self._env.get_attr("scene_name") if self._has["scene_name"] else [""]
         return {name: self.area(names.index(name)) for name in dict.fromkeys(names)}
 
@@ -75,8 +70,7 @@ class RecordedEnvironments:
 
     def _capture(self, index: int, poses: NDArray[np.floating], camera: Intrinsics) -> list[tuple[NDArray, NDArray]]:
         """Picture and depth at each pose."""
-        frames: Frames = self._env.env_method("capture", np.ascontiguousarray(poses), camera, indices=index)[0]
-        assert frames.rgb is not None
+        frames = self._env.env_method("capture", np.ascontiguousarray(poses), camera, indices=index)[0]
         return list(zip(frames.rgb, frames.depth, strict=True))
 
     def _get(self, index: int, name: str, default: Any) -> Any:

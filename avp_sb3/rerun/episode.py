@@ -2,15 +2,15 @@
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rerun as rr
+from avp_habitat.rollout.png import GREY_16
 from numpy.typing import NDArray
 from PIL import Image
 
-from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout import images
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from avp_habitat.task.trajectory import Trajectory
 
 Time = int | np.timedelta64 | np.datetime64
-"""Of a time line: a number in a sequence, a duration, or a moment."""
+"""A number in a sequence, a duration, or a moment."""
 _UNSEEN_COLOUR, _SEEN_COLOUR = 0xAEB4C0FF, 0x35B779FF
 _PATH_COLOUR, _VIEW_COLOUR, _AGENT_COLOUR = (178, 34, 52), (228, 120, 51, 120), (40, 40, 44)
 _PLOT_COLOURS = [0x35B779FF, 0x8C7AE6FF, 0x95A5A6FF, 0xE15759FF, 0x4E79A7FF]
@@ -41,7 +41,7 @@ class EncodedView:
 
 
 @dataclass(frozen=True)
-class Episode:
+class RecordedEpisode:
     """What a recording shows of t steps."""
 
     camera_to_world: NDArray[np.floating]
@@ -64,42 +64,27 @@ class Episode:
 
 def episode_of(
     trajectory: "Trajectory", area: "NavigableArea | None", intrinsics: Intrinsics, views: Mapping[int, EncodedView]
-) -> Episode:
-    """The episode of an environment; without its area no floor is shown.
-
-    Raises:
-        UsageError: the trajectory belongs to another scene than the area.
-    """
+) -> RecordedEpisode:
+    """The episode of an environment; without its area no floor is shown."""
     parts = {f"reward/{name}": values for name, values in trajectory.reward_parts.items()}
-    episode = Episode(
+    floor: dict[str, Any] = {}
+    if area is not None:
+        floor = {"cells": np.asarray(area.centres), "first_seen": trajectory.first_seen, "cell_m": area.cell_m}
+    return RecordedEpisode(
         camera_to_world=trajectory.camera_to_world,
         path=np.concatenate([trajectory.start[None], trajectory.position]),
         intrinsics=intrinsics,
         views=views,
         plots={"coverage": trajectory.coverage, "action": trajectory.action, "reward/sum": trajectory.reward, **parts},
+        **floor,
     )
-    if area is None:
-        return episode
-    if len(trajectory.first_seen) != len(area.centres):
-        raise UsageError(
-            f"the trajectory knows {len(trajectory.first_seen)} navigable cells, the environment's area "
-            f"{len(area.centres)}: they belong to different scenes"
-        )
-    return replace(episode, cells=np.asarray(area.centres), first_seen=trajectory.first_seen, cell_m=area.cell_m)
 
 
 def encode_view(rgb: NDArray[np.uint8], depth: NDArray[np.floating]) -> EncodedView:
-    """Compress `(h, w, 3)` uint8 as JPEG, and `(h, w)` planar depth in metres as 16-bit PNG."""
-    buffer = io.BytesIO()
-    Image.fromarray(images.encode_depth(depth)).save(buffer, format="PNG", compress_level=4)
-    return EncodedView(encode_jpeg(rgb), buffer.getvalue())
-
-
-def encode_jpeg(rgb: NDArray[np.uint8]) -> bytes:
-    """A `(h, w, 3)` uint8 picture as a JPEG file."""
+    """Compress a `(h, w, 3)` picture, and its `(h, w)` planar depth in metres."""
     buffer = io.BytesIO()
     Image.fromarray(rgb).save(buffer, format="JPEG", quality=_JPEG_QUALITY)
-    return buffer.getvalue()
+    return EncodedView(buffer.getvalue(), images.encode_png(images.encode_depth(depth), GREY_16))
 
 
 def spread_indices(count: int, at_most: int) -> list[int]:
@@ -110,7 +95,7 @@ def spread_indices(count: int, at_most: int) -> list[int]:
 def log_episode(
     recording: rr.RecordingStream,
     root: str,
-    episode: Episode,
+    episode: RecordedEpisode,
     *,
     times: Mapping[str, Time],
     first_step: int = 0,
@@ -153,20 +138,20 @@ def log_episode(
 def log_at(recording: rr.RecordingStream, path: str, value: Any, times: Mapping[str, Time]) -> None:
     """Add a value at one place on several time lines."""
     for name, time in times.items():
-        recording.set_time(name, **{_kind(time): time})
+        recording.set_time(name, **_by_kind(time, time))
     recording.log(path, value)
     recording.reset_time()
 
 
 def time_columns(steps: Sequence[int], times: Mapping[str, Time]) -> list[rr.TimeColumn]:
     """The time line `step`, and others that have the same value at all of these steps."""
-    columns = [rr.TimeColumn(name, **{_kind(time): np.full(len(steps), time)}) for name, time in times.items()]
+    columns = [rr.TimeColumn(name, **_by_kind(time, np.full(len(steps), time))) for name, time in times.items()]
     return [rr.TimeColumn("step", sequence=list(steps)), *columns]
 
 
-def _kind(time: Time) -> Any:
-    """Rerun's word for the kind of a time line."""
-    return {"m": "duration", "M": "timestamp"}.get(np.asarray(time).dtype.kind, "sequence")
+def _by_kind(time: Time, value: Any) -> dict[str, Any]:
+    """The argument by which Rerun takes a time of this kind."""
+    return {{"m": "duration", "M": "timestamp"}.get(np.asarray(time).dtype.kind, "sequence"): value}
 
 
 def metric_path(root: str, name: str) -> str:
@@ -180,7 +165,7 @@ def _plot_path(root: str, name: str) -> str:
     return "/".join([root, "plots", *map(rr.escape_entity_path_part, name.split("/"))])
 
 
-def _log_scene(recording: rr.RecordingStream, root: str, episode: Episode) -> None:
+def _log_scene(recording: rr.RecordingStream, root: str, episode: RecordedEpisode) -> None:
     """What holds at all times."""
     world = f"{root}/world"
     recording.log(world, rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
@@ -188,8 +173,7 @@ def _log_scene(recording: rr.RecordingStream, root: str, episode: Episode) -> No
     if episode.views:
         recording.log(f"{world}/camera", _pinhole(episode.intrinsics), static=True)
     if len(episode.cells):
-        cells = rr.Points3D(episode.cells, radii=[0.45 * episode.cell_m])
-        recording.log(f"{world}/floor", cells, static=True)
+        recording.log(f"{world}/floor", rr.Points3D(episode.cells, radii=[0.45 * episode.cell_m]), static=True)
     for index, name in enumerate(episode.plots):
         colour = _PLOT_COLOURS[index % len(_PLOT_COLOURS)]
         dots = rr.SeriesPoints(colors=[colour], marker_sizes=[2])
@@ -197,7 +181,7 @@ def _log_scene(recording: rr.RecordingStream, root: str, episode: Episode) -> No
         recording.log(_plot_path(root, name), looks, static=True)
 
 
-def _floor_changes(episode: Episode) -> tuple[list[int], rr.ComponentColumnList]:
+def _floor_changes(episode: RecordedEpisode) -> tuple[list[int], rr.ComponentColumnList]:
     """The cells' colours at each step (from 0) that observed new ones; at fewer steps on large floors."""
     cells, seen = len(episode.cells), np.asarray(episode.first_seen)
     changes = [0, *sorted({int(step) - 1 for step in seen[seen > 0]} - {0})]
@@ -207,7 +191,7 @@ def _floor_changes(episode: Episode) -> tuple[list[int], rr.ComponentColumnList]
     return changes, rr.Points3D.columns(colors=colours.ravel()).partition([cells] * len(changes))
 
 
-def _send_views(recording: rr.RecordingStream, path: str, episode: Episode, times: list[rr.TimeColumn]) -> None:
+def _send_views(recording: rr.RecordingStream, path: str, episode: RecordedEpisode, times: list[rr.TimeColumn]) -> None:
     """The pictures, and where their camera stood."""
     steps = sorted(episode.views)
     views = [episode.views[step] for step in steps]
@@ -238,7 +222,7 @@ def _pinhole(intrinsics: Intrinsics, colour: tuple[int, int, int] | None = None)
     )
 
 
-def _pyramids(episode: Episode) -> NDArray[np.floating]:
+def _pyramids(episode: RecordedEpisode) -> NDArray[np.floating]:
     """`(t, 11, 3)` one line strip per viewpoint: the image's border and its edges to the camera centre."""
     camera = episode.intrinsics
     left, right = -camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx

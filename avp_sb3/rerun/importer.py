@@ -8,7 +8,7 @@ import argparse
 import os
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,8 +21,7 @@ INCOMPATIBLE = 66
 """Rerun's exit code of an importer that does not know a path."""
 _NAME, _DEPRECATED_PREFIX = "rerun-importer-avp", "rerun-loader-"
 _META, _MARK, _HEAD_BYTES = "rollout.json", b"avp-rollout", 65_536
-# Rerun gives every recording these by itself.
-_AUTOMATIC = ("log_time", "log_tick")
+_AUTOMATIC = ("log_time", "log_tick")  # Rerun gives every recording these by itself.
 
 
 def main() -> int:
@@ -90,42 +89,32 @@ def _answer(folders: Sequence[Path], options: argparse.Namespace) -> None:
     from avp_habitat.rollout.format import read_rollout
     from avp_sb3.rerun.rollout import log_rollouts
 
-    times, prefix = dict(_times(options)), options.entity_path_prefix
-    joins = options.recording_id is not None and options.recording_id == options.opened_recording_id
-    is_alone = not joins and not prefix.strip("/")
+    prefix, identity = options.entity_path_prefix, options.recording_id
+    is_alone = not prefix.strip("/") and (identity is None or identity != options.opened_recording_id)
     application = options.application_id or APPLICATION
-    recording = rr.RecordingStream(application, recording_id=options.recording_id, send_properties=is_alone)
-    stream = recording.binary_stream()
+    recording = rr.RecordingStream(application, recording_id=identity, send_properties=is_alone)
     rollouts = [read_rollout(folder) for folder in folders]
-    log_rollouts(recording, rollouts, prefix=prefix, times=times, with_layout=is_alone)
-    sys.stdout.buffer.write(stream.read() or b"")
+    log_rollouts(recording, rollouts, prefix=prefix, times=_times(options), with_layout=is_alone)
+    sys.stdout.buffer.write(recording.binary_stream().read() or b"")
     sys.stdout.buffer.flush()
 
 
-def _times(options: argparse.Namespace) -> "Iterator[tuple[str, Time]]":
+def _times(options: argparse.Namespace) -> "dict[str, Time]":
     """The time lines that an application wants the rollouts to have, each with its one value."""
     import numpy as np
 
-    moments = dict(_pairs("--sequence", options.sequence))
-    yield from _pairs("--time_sequence", options.time_sequence)
-    for name, value in _pairs("--time_duration_nanos", options.time_duration_nanos):
+    moments = dict(options.sequence)
+    times: list[tuple[str, Time]] = [*options.time_sequence]
+    for name, value in options.time_duration_nanos:
         # Rerun 0.41 sends moments as durations; only the older flag beside them tells.
-        yield name, np.datetime64(value, "ns") if name in moments else np.timedelta64(value, "ns")
-    for name, value in _pairs("--time_timestamp_nanos", options.time_timestamp_nanos):
-        yield name, np.datetime64(value, "ns")
+        times.append((name, np.datetime64(value, "ns") if name in moments else np.timedelta64(value, "ns")))
+    times += [(name, np.datetime64(value, "ns")) for name, value in options.time_timestamp_nanos]
+    return {name: time for name, time in times if name not in _AUTOMATIC}
 
 
-def _pairs(option: str, texts: Sequence[str]) -> Iterator[tuple[str, int]]:
-    from avp_habitat.errors import UsageError
-
-    for text in texts:
-        name, _, value = text.rpartition("=")
-        try:
-            number = int(value)
-        except ValueError:
-            raise UsageError(f"{option}: expected NAME=NUMBER with a whole number, got {text!r}") from None
-        if name not in _AUTOMATIC:
-            yield name, number
+def _named_number(text: str) -> tuple[str, int]:
+    name, _, number = text.rpartition("=")
+    return name, int(number)
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -133,20 +122,15 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog=_NAME,
         allow_abbrev=False,
-        description="Called by Rerun for the paths that it opens: try `rerun ROLLOUT`. Writes the recording of a "
-        f"rollout folder, of its rollout.json or of a folder of rollouts to the standard output; exit code "
-        f"{INCOMPATIBLE} for everything else.",
+        description="Called by Rerun for the paths that it opens: try `rerun ROLLOUT`. Writes the recording to the "
+        f"standard output; exit code {INCOMPATIBLE} for what is no rollout.",
     )
     parser.add_argument("path", type=Path, help="rollout folder, its rollout.json, or a folder of rollouts")
     parser.add_argument("--application-id", help="application of the recording")
     parser.add_argument("--recording-id", help="recording to add to")
     parser.add_argument("--opened-recording-id", help="recording on show")
     parser.add_argument("--entity-path-prefix", default="", help="entity path above all that is added")
-    for flag, text in (
-        ("--time_sequence", "further time line with the value that it has throughout"),
-        ("--time_duration_nanos", "likewise, a duration in nanoseconds"),
-        ("--time_timestamp_nanos", "likewise, nanoseconds since 1970"),
-        ("--sequence", "older name, sent along with the others"),
-    ):
-        parser.add_argument(flag, action="append", default=[], metavar="NAME=NUMBER", help=text)
+    pairs = {"type": _named_number, "action": "append", "default": [], "metavar": "NAME=NUMBER"}
+    for flag in ("--time_sequence", "--time_duration_nanos", "--time_timestamp_nanos", "--sequence"):
+        parser.add_argument(flag, help="a further time line with the value that it has throughout", **pairs)
     return parser.parse_known_args(argv)[0]

@@ -61,12 +61,7 @@ def rollout_blueprint(roots: Mapping[str, str], *, with_map: bool) -> rrb.Bluepr
 
 
 def _episode(
-    root: str,
-    name: str,
-    plots: rrb.Container,
-    *,
-    with_map: bool = False,
-    eye: rrb.EyeControls3D | None = None,
+    root: str, name: str, plots: rrb.Container, *, with_map: bool = False, eye: rrb.EyeControls3D | None = None
 ) -> rrb.Container:
     """The scene, beside it the camera, the map of a rollout and the plots."""
     pictures = [rrb.Spatial2DView(origin=f"{root}/world/camera/rgb", name="RGB")]

@@ -2,10 +2,9 @@
 
 import csv
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -22,9 +21,8 @@ from avp_habitat.task.settings import ACTION_NAMES
 from avp_sb3.rerun import APPLICATION
 from avp_sb3.rerun.episode import (
     EncodedView,
-    Episode,
+    RecordedEpisode,
     Time,
-    encode_jpeg,
     encode_view,
     log_at,
     log_episode,
@@ -43,30 +41,23 @@ _COLOURS = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (213, 94, 0), (204, 121
 
 @dataclass(frozen=True)
 class RolloutContents:
-    """What a recording shows of a rollout."""
+    """What a recording shows of a rollout besides its `rollout.json`."""
 
-    episode: Episode
+    episode: RecordedEpisode
     """Its steps and pictures."""
     room: Cloud
     """Out of the pictures."""
     map: bytes | None
     """`trajectory.png`; None where the rollout was written without it."""
-    metrics: dict[str, float] = field(default_factory=dict)
-    """The figures of `rollout.json`."""
-    about: str = ""
-    """Markdown: where the rollout comes from and its figures."""
 
 
-def read_contents(
-    rollout: Rollout, *, pictures: int = _PICTURES, progress: Callable[[], Any] = lambda: None
-) -> RolloutContents:
+def read_contents(rollout: Rollout, *, pictures: int = _PICTURES) -> RolloutContents:
     """Read the tables and pictures of a rollout.
 
     Args:
         rollout: as read by `avp_habitat.rollout.format.read_rollout`.
         pictures: so many views at most are shown with pictures, spread over the rollout. Larger ones than 640 pixels
             are subsampled.
-        progress: called after each picture.
 
     Raises:
         RolloutError: a file is missing or unreadable, or `steps.csv` is not one row of finite numbers per frame.
@@ -74,23 +65,25 @@ def read_contents(
     plots, feet = read_steps(rollout.folder / "steps.csv", len(rollout.frames))
     width, height = rollout.intrinsics.width, rollout.intrinsics.height
     stride = min(-(-max(width, height) // _LONGEST_PX), width, height)
-    camera = _subsampled(rollout.intrinsics, stride)
+    # An incomplete block at the border is dropped.
+    focal_and_centre = {name: getattr(rollout.intrinsics, name) / stride for name in ("fx", "fy", "cx", "cy")}
+    camera = Intrinsics(width=width // stride, height=height // stride, **focal_and_centre)
     chosen = spread_indices(len(rollout.frames), pictures)
     views: dict[int, EncodedView] = {}
 
     def frames() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.floating]]]:
         for step in chosen:
-            rgb, depth, views[step] = _read_view(rollout.frames[step], camera, stride)
+            rgb, depth = _read_view(rollout.frames[step], camera, stride)
+            views[step] = encode_view(rgb, depth)
             yield rgb, depth
-            progress()
 
     poses = np.array([view.camera_to_world for view in rollout.frames]).reshape(-1, 4, 4)
     room = room_points(frames(), camera, poses[chosen])
-    picture, metrics = rollout.folder / "trajectory.png", rollout.meta.get("metrics", {})
+    picture = rollout.folder / "trajectory.png"
     if drawn := picture.exists():
         images.read_rgb(picture)
-    episode = Episode(poses, feet, camera, views, plots)
-    return RolloutContents(episode, room, picture.read_bytes() if drawn else None, metrics, _about(rollout, metrics))
+    episode = RecordedEpisode(poses, feet, camera, views, plots)
+    return RolloutContents(episode, room, picture.read_bytes() if drawn else None)
 
 
 def read_steps(path: Path, frames: int) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
@@ -149,42 +142,21 @@ def _numbers(path: Path, columns: Mapping[str, list[str]], name: str) -> NDArray
     return values
 
 
-def _read_view(view: View, camera: Intrinsics, stride: int) -> tuple[NDArray, NDArray, EncodedView]:
-    """Picture, depth in metres, and both compressed."""
-    rgb, depth = images.read_rgb(view.image), images.read_depth(view.depth)
-    if stride == 1:
-        return rgb, depth, EncodedView(encode_jpeg(rgb), view.depth.read_bytes())
+def _read_view(view: View, camera: Intrinsics, stride: int) -> tuple[NDArray[np.uint8], NDArray[np.floating]]:
+    """Picture and depth in metres."""
     height, width = camera.height * stride, camera.width * stride
-    rgb = np.asarray(Image.fromarray(rgb[:height, :width]).reduce(stride))
+    rgb = np.asarray(Image.fromarray(images.read_rgb(view.image)[:height, :width]).reduce(stride))
     # Depth is picked, not averaged: a mean of two surfaces is none.
-    depth = np.ascontiguousarray(depth[stride // 2 : height : stride, stride // 2 : width : stride])
-    return rgb, depth, encode_view(rgb, depth)
+    depth = images.read_depth(view.depth)[stride // 2 : height : stride, stride // 2 : width : stride]
+    return rgb, np.ascontiguousarray(depth)
 
 
-def _subsampled(camera: Intrinsics, stride: int) -> Intrinsics:
-    """The camera of pictures of which every n-th pixel is kept; an incomplete block at the border is dropped."""
-    focal_and_centre = {name: getattr(camera, name) / stride for name in ("fx", "fy", "cx", "cy")}
-    return Intrinsics(width=camera.width // stride, height=camera.height // stride, **focal_and_centre)
-
-
-def _about(rollout: Rollout, metrics: Mapping[str, float]) -> str:
-    """Tables of the metrics and of all else in `rollout.json` that says where the rollout comes from."""
-    facts = {name: _plain(value) for name, value in rollout.meta.items() if name not in ("metrics", "pose_convention")}
-    lines = [f"# {_cell(rollout.folder.resolve().name)}", "", "| metric | value |", "|---|---|"]
-    lines += [f"| {_cell(name)} | {value:.6g} |" for name, value in metrics.items()]
-    lines += ["", "| rollout.json | |", "|---|---|"]
-    lines += [f"| {_cell(name)} | {_cell(value)} |" for name, value in facts.items()]
-    return "\n".join(lines) + "\n"
-
-
-def _plain(value: object) -> str:
-    if isinstance(value, dict):
-        return ", ".join(f"{name} {_plain(entry)}" for name, entry in value.items())
-    return value if isinstance(value, str) else json.dumps(value)
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("\n", " ")
+def _about(rollout: Rollout) -> str:
+    """The figures as a table, and all else in `rollout.json` that says where the rollout comes from."""
+    facts = {name: value for name, value in rollout.meta.items() if name not in ("metrics", "pose_convention")}
+    lines = [f"# {rollout.folder.resolve().name}", "", "| metric | value |", "|---|---|"]
+    lines += [f"| {name} | {value:.6g} |" for name, value in rollout.meta.get("metrics", {}).items()]
+    return "\n".join([*lines, "", "```json", json.dumps(facts, indent=2, ensure_ascii=False), "```", ""])
 
 
 def log_rollouts(
@@ -195,7 +167,7 @@ def log_rollouts(
     times: Mapping[str, Time] | None = None,
     always_named: bool = False,
     with_layout: bool = True,
-    progress: Callable[[], Any] = lambda: None,
+    progress: bool = False,
 ) -> None:
     """Add rollouts to a recording, after all of them have been read.
 
@@ -207,43 +179,46 @@ def log_rollouts(
         times: further time lines, each with the one value that it has for all of the rollouts.
         always_named: one rollout lies under its folder's name too.
         with_layout: give the recording its name and layout.
-        progress: called after each picture.
+        progress: show how many have been read.
 
     Raises:
         RolloutError: a rollout is damaged; nothing has been added.
     """
-    names = _unique_names([rollout.folder.resolve().name for rollout in rollouts])
+    names = [rollout.folder.resolve().name for rollout in rollouts]
+    earlier = [names[:index].count(name) for index, name in enumerate(names)]
+    names = [f"{name}-{count + 1}" if count else name for name, count in zip(names, earlier, strict=True)]
     above = f"/{prefix.strip('/')}".rstrip("/")
     roots = [f"{above}/{rr.escape_entity_path_part(name)}" for name in names]
     if len(rollouts) == 1 and not always_named:
         roots = [above]
-    pictures = _pictures_of_each(rollouts)
-    contents = [read_contents(rollout, pictures=pictures, progress=progress) for rollout in rollouts]
+    pictures = max(1, min(_PICTURES, _MOST_PICTURES // len(rollouts)))
+    bar = progress_bar(rollouts, unit="rollout", desc="reading", disable=not progress)
+    contents = [read_contents(rollout, pictures=pictures) for rollout in bar]
     if with_layout:
         with_map = any(each.map is not None for each in contents)
         # A default that arrives after the first data is too late: the viewer has made up a layout of its own by then.
         layout = rollout_blueprint(dict(zip(roots, names, strict=True)), with_map=with_map)
         recording.send_blueprint(layout, make_active=True, make_default=True)
         recording.send_recording_name(", ".join(names))
-    for index, (root, name, each) in enumerate(zip(roots, names, contents, strict=True)):
-        _log_rollout(recording, root, each, {"episode": 0, "env_step": 0, **(times or {})})
+    for index, (root, rollout, each) in enumerate(zip(roots, rollouts, contents, strict=True)):
+        _log_rollout(recording, root, rollout, each, {"episode": 0, "env_step": 0, **(times or {})})
         if len(roots) > 1:
-            curve = rr.SeriesLines(names=[name], colors=[_COLOURS[index % len(_COLOURS)]])
+            curve = rr.SeriesLines(names=[names[index]], colors=[_COLOURS[index % len(_COLOURS)]])
             recording.log(f"{root}/plots/coverage", curve, static=True)
 
 
 def _log_rollout(
-    recording: rr.RecordingStream, root: str, contents: RolloutContents, times: Mapping[str, Time]
+    recording: rr.RecordingStream, root: str, rollout: Rollout, contents: RolloutContents, times: Mapping[str, Time]
 ) -> None:
     log_episode(recording, root, contents.episode, times=times)
     log_room(recording, f"{root}/world/room", contents.room)
     if contents.map is not None:
         recording.log(f"{root}/map", rr.EncodedImage(contents=contents.map, media_type="image/png"), static=True)
-    about = rr.TextDocument(contents.about, media_type=rr.MediaType.MARKDOWN)
+    about = rr.TextDocument(_about(rollout), media_type=rr.MediaType.MARKDOWN)
     recording.log(f"{root}/about", about, static=True)
-    last = max(len(contents.episode.camera_to_world) - 1, 0)
-    for name, value in contents.metrics.items():
-        log_at(recording, metric_path(root, name), rr.Scalars(value), {"step": last, **times})
+    times = {"step": max(len(rollout.frames) - 1, 0), **times}
+    for name, value in rollout.meta.get("metrics", {}).items():
+        log_at(recording, metric_path(root, name), rr.Scalars(value), times)
 
 
 def write_rollout_recording(folders: Sequence[str | Path], target: str | Path, *, progress: bool = False) -> Path:
@@ -252,7 +227,7 @@ def write_rollout_recording(folders: Sequence[str | Path], target: str | Path, *
     Args:
         folders: rollout folders.
         target: the file to make.
-        progress: show a progress bar.
+        progress: as for `log_rollouts`.
 
     Raises:
         UsageError: the target exists, or no folder is given.
@@ -261,28 +236,9 @@ def write_rollout_recording(folders: Sequence[str | Path], target: str | Path, *
     if not folders:
         raise UsageError("expected at least one rollout folder, got none")
     check_new(Path(target))
-    rollouts = [read_rollout(folder) for folder in folders]
     recording = rr.RecordingStream(APPLICATION)
-    stream = recording.binary_stream()
-    total = sum(min(len(rollout.frames), _pictures_of_each(rollouts)) for rollout in rollouts)
-    with progress_bar(total=total, unit="picture", desc=f"recording {target}", disable=not progress) as bar:
-        log_rollouts(recording, rollouts, always_named=True, progress=bar.update)
+    rollouts = [read_rollout(folder) for folder in folders]
+    log_rollouts(recording, rollouts, always_named=True, progress=progress)
     with atomic_file(target, replace=False, failure=RolloutError) as partial:
-        partial.write_bytes(stream.read(flush_timeout_sec=_FLUSH_S) or b"")
+        partial.write_bytes(recording.binary_stream().read(flush_timeout_sec=_FLUSH_S) or b"")
     return Path(target)
-
-
-def _pictures_of_each(rollouts: Sequence[Rollout]) -> int:
-    return max(1, min(_PICTURES, _MOST_PICTURES // len(rollouts)))
-
-
-def _unique_names(names: Sequence[str]) -> list[str]:
-    """Equal names numbered from the second one on."""
-    unique: list[str] = []
-    for name in names:
-        candidate, count = name, 1
-        while candidate in unique:
-            count += 1
-            candidate = f"{name}-{count}"
-        unique.append(candidate)
-    return unique

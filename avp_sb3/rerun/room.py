@@ -52,7 +52,7 @@ def room_points(
         seen, colours = np.asarray(depth)[::stride, ::stride].astype(np.float64), np.asarray(rgb)[::stride, ::stride]
         hit = (seen > 0) & (seen <= max_depth_m)
         points = (directions[hit] * seen[hit][:, None]) @ pose[:3, :3].T + pose[:3, 3]
-        rows = np.concatenate([points, colours[hit], np.ones((len(points), 1))], axis=1)
+        rows = np.column_stack([points, colours[hit].astype(np.float64), np.ones(len(points))])
         clouds.append(_summed(rows[points[:, 1] <= ceiling], voxel_m))
     rows = _summed(np.concatenate(clouds), voxel_m)
     while len(rows) > at_most:
@@ -63,17 +63,11 @@ def room_points(
 
 
 def _summed(rows: NDArray[np.float64], voxel_m: float, *, from_least: bool = False) -> NDArray[np.float64]:
-    """Add up the rows whose mean places lie in the same voxel.
-
-    Args:
-        rows: `(n, 7)` sums over pixels: place in metres, red, green, blue, and their number.
-        voxel_m: side of a voxel in metres.
-        from_least: the grid begins at the least place, not at the world's origin.
-    """
+    """Add up the `(n, 7)` sums over pixels (place, colour, how many) whose mean places lie in the same voxel."""
     places = rows[:, :3] / rows[:, 6:]
     cells = np.floor((places - (places.min(axis=0) if from_least else 0)) / voxel_m).astype(np.int64)
     _, group = np.unique(cells @ _CELL_KEY, return_inverse=True)
-    return np.stack([np.bincount(group, weights=column) for column in rows.T], axis=1)
+    return np.stack([np.bincount(group, weights=column).astype(np.float64) for column in rows.T], axis=1)
 
 
 def log_room(recording: rr.RecordingStream, path: str, cloud: Cloud) -> None:

@@ -4,7 +4,7 @@ import signal
 import time
 import traceback
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing.process import BaseProcess
@@ -125,7 +125,7 @@ class AVPSubprocVecEnv(SubprocVecEnv):
         self.settings = settings or TaskSettings(lookup=choices[0].single_rays)
         self._asked: list[int] = []
         self._fixed: dict[str, list[Any]] = {}
-        makes = [
+        makes: list[Callable[[], gymnasium.Env]] = [
             partial(
                 _Agents,
                 self.settings,

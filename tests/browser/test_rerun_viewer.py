@@ -13,10 +13,10 @@ import pytest
 from corridor import RGB
 from mlflow_page import CHROMIUM
 from PIL import Image
+from rrd import PROGRAM
 from tracking import ppo
 
 from avp_sb3 import RerunCallback
-from avp_sb3.rerun.live import program
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -61,7 +61,7 @@ def served(*recordings):
     """The page of Rerun's own server of files, on loopback."""
     port, web_port = free_port(), free_port()
     options = ["--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(web_port)]
-    server = subprocess.Popen([program(), *options, *recordings], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    server = subprocess.Popen([PROGRAM, *options, *recordings], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         until = time.monotonic() + 60
         while not (listens(port) and listens(web_port)):

@@ -23,7 +23,7 @@ from avp_habitat.rollout.format import read_rollout
 from avp_habitat.scenes.builtin.room import generate_room
 from avp_habitat.scenes.loader import load_scene
 from avp_habitat.scenes.mesh import TexturedMesh
-from avp_habitat.sight.coverage import candidates
+from avp_habitat.sight.rules import candidates
 from avp_habitat.simulators.raycast import RaycastSimulator
 from avp_habitat.task.env import AVPEnv
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from avp_habitat.rollout.capture import heldout_poses
-from avp_habitat.sight.coverage import candidates
+from avp_habitat.sight.rules import candidates
 from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.settings import TaskSettings

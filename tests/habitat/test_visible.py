@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from shapes import furnished, mesh_of, write_room
 
-from avp_habitat.policies.oracle.lattice import lattice_of, unpack
+from avp_habitat.policies.oracle.places import scene_places
 from avp_habitat.policies.oracle.policy import OraclePolicy, SurveyPolicy
 from avp_habitat.policies.oracle.search import BeamSettings
 from avp_habitat.poses import Intrinsics, camera_to_world
 from avp_habitat.scenes.loader import Scene
+from avp_habitat.sight.bits import unpack
 from avp_habitat.sight.tables import reached_around
 from avp_habitat.simulators.base import SingleRays
 from avp_habitat.simulators.habitat import HabitatSimulator
@@ -143,18 +144,18 @@ def test_places_reach_points_in_every_direction(simulator):
 
 
 def test_planners_that_know_the_scene_plan_in_either(simulator, monkeypatch):
-    """The lattice is that of the geometry; what is planned is what the episode then counts."""
+    """What the places see is what the geometry says; what is planned is what the episode then counts."""
     if not isinstance(simulator, SingleRays):  # It looks around with pictures, each of whose pixels costs a ray here.
-        monkeypatch.setattr("avp_habitat.policies.oracle.lattice._PANORAMAS", 12)
+        monkeypatch.setattr("avp_habitat.policies.oracle.places._PANORAMAS", 12)
     env = AVPEnv(simulator=simulator, budget=12, reward="coverage", width=32, height=24)
-    lattice = lattice_of(simulator, env.settings)
-    sees = unpack(lattice.sees, len(lattice.points))
-    truth = np.array([clear(place + [0, 1.5, 0], lattice.points) for place in lattice.places])
+    places = scene_places(simulator, env.settings)
+    sees = unpack(places.sees, len(places.points))
+    truth = np.array([clear(place + [0, 1.5, 0], places.points) for place in places.position])
     assert (sees == truth).mean() >= 0.99
     for kind in (OraclePolicy, SurveyPolicy):
-        policy = kind(lambda: agent_views(env), BeamSettings(width=30))
+        policy = kind(lambda: agent_views(env), beam=BeamSettings(width=30))
         (observation, _), info = env.reset(seed=1), {}
         for _ in range(12):
             observation, *_, info = env.step(int(policy.predict(observation)[0]))
-        assert info["coverage"] == pytest.approx(policy.plan(0).coverage[-1], abs=1e-9)
+        assert info["coverage"] == pytest.approx(policy.planner(0).plan.coverage[-1], abs=1e-9)
         assert info["coverage"] > 0.6

@@ -1,115 +1,42 @@
-"""The compiled loops of the oracle over bit sets of floor cells (64 cells to a word)."""
+"""The compiled loops of the oracle over bit sets of floor cells."""
 
 import numpy as np
 
 from avp_habitat.compiled import njit
+from avp_habitat.sight.bits import ONE, lowest
+from avp_habitat.sight.rules import in_camera, in_image
 
-_ONE = np.uint64(1)
 _STRAIGHT, _DIAGONAL = 5, 7
 """Lengths of a step to a neighbour of a grid, in fifths of the grid's spacing (7 / 5 is the root of 2 within 1 %)."""
 LENGTHS_PER_SPACING = 5
 NEVER = 255
-"""In `reach_tables`: no walk on the lattice leads to a place that sees the cell."""
+"""In `reach_tables`: no walk leads to a place that sees the cell."""
 _FAR = 1 << 30
 
 
 @njit(cache=True)
-def _trailing(word):
-    """Index of the lowest set bit of a word that is not 0."""
-    low = word & (~word + _ONE)
-    index = 0
-    for shift in (32, 16, 8, 4, 2, 1):
-        if low >> np.uint64(shift):
-            low >>= np.uint64(shift)
-            index += shift
-    return index
-
-
-@njit(cache=True)
-def _count(word):
-    """Number of set bits."""
-    word = word - ((word >> _ONE) & np.uint64(0x5555555555555555))
-    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return int((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
-
-
-@njit(cache=True)
-def count_rows(sets):
-    """`(n,)` sizes of `(n, words)` sets."""
-    sizes = np.zeros(len(sets), np.int64)
-    for i in range(len(sets)):
-        for word in sets[i]:
-            sizes[i] += _count(word)
-    return sizes
-
-
-@njit(cache=True)
-def gains(sets, missing):
-    """`(n,)` how many members of `missing` `(words,)` each of `(n, words)` sets holds."""
-    result = np.zeros(len(sets), np.int64)
-    for i in range(len(sets)):
-        for k in range(len(missing)):
-            result[i] += _count(sets[i, k] & missing[k])
-    return result
-
-
-@njit(cache=True)
-def inside_frustum(cells, camera, normals, points):
-    """Members of `cells` `(words,)` that lie inside a view.
-
-    `camera` `(3,)` is its centre, `normals` `(4, 3)` point inwards from the image's left, top, right and bottom
-    (the last two borders do not belong to the image), `points` `(m, 3)` are the cells' floor points.
-    """
-    result = np.zeros_like(cells)
-    for k in range(len(cells)):
-        left = cells[k]
-        while left:
-            bit = _trailing(left)
-            left &= left - _ONE
-            c = 64 * k + bit
-            x, y, z = points[c, 0] - camera[0], points[c, 1] - camera[1], points[c, 2] - camera[2]
-            if (
-                normals[0, 0] * x + normals[0, 1] * y + normals[0, 2] * z >= 0
-                and normals[1, 0] * x + normals[1, 1] * y + normals[1, 2] * z >= 0
-                and normals[2, 0] * x + normals[2, 1] * y + normals[2, 2] * z > 0
-                and normals[3, 0] * x + normals[3, 1] * y + normals[3, 2] * z > 0
-            ):
-                result[k] |= _ONE << np.uint64(bit)
-    return result
-
-
-@njit(cache=True)
-def _neighbours(grid, at):
-    """Grid indices and lengths of up to 8 neighbours; a diagonal needs both cells beside it."""
-    found, lengths, count = np.empty(8, np.int64), np.empty(8, np.int64), 0
-    rows, columns = grid.shape
-    row, column = at // columns, at % columns
-    for down in range(-1, 2):
-        for right in range(-1, 2):
-            r, c = row + down, column + right
-            if (down == 0 and right == 0) or r < 0 or c < 0 or r >= rows or c >= columns or grid[r, c] < 0:
-                continue
-            if down != 0 and right != 0 and (grid[row, c] < 0 or grid[r, column] < 0):
-                continue
-            found[count] = r * columns + c
-            lengths[count] = _DIAGONAL if down != 0 and right != 0 else _STRAIGHT
-            count += 1
-    return found[:count], lengths[:count]
-
-
-@njit(cache=True)
 def neighbour_table(grid, count):
-    """`(count, 8)` numbers and lengths of the neighbours of the places of a grid of numbers (-1: no place)."""
-    columns = grid.shape[1]
+    """Up to 8 neighbours of the places of a grid of numbers (-1: no place); a diagonal needs both places beside it.
+
+    Returns:
+        `(count, 8)` their numbers, then -1, and `(count, 8)` the lengths of the ways to them.
+    """
+    rows, columns = grid.shape
     other, length = np.full((count, 8), -1, np.int64), np.zeros((count, 8), np.int64)
-    for row in range(grid.shape[0]):
+    for row in range(rows):
         for column in range(columns):
-            if grid[row, column] >= 0:
-                found, lengths = _neighbours(grid, row * columns + column)
-                for j in range(len(found)):
-                    other[grid[row, column], j] = grid[found[j] // columns, found[j] % columns]
-                    length[grid[row, column], j] = lengths[j]
+            place, found = grid[row, column], 0
+            for down in range(-1, 2):
+                for right in range(-1, 2):
+                    r, c = row + down, column + right
+                    if place < 0 or (down == 0 and right == 0) or r < 0 or c < 0 or r >= rows or c >= columns:
+                        continue
+                    diagonal = down != 0 and right != 0
+                    if grid[r, c] < 0 or (diagonal and (grid[row, c] < 0 or grid[r, column] < 0)):
+                        continue
+                    other[place, found] = grid[r, c]
+                    length[place, found] = _DIAGONAL if diagonal else _STRAIGHT
+                    found += 1
     return other, length
 
 
@@ -186,7 +113,7 @@ def _watchers(sees, points, places, cell, least_m, found):
     """Collect the places that see a cell from at least so far on the floor; returns how many."""
     count = 0
     for i in range(len(places)):
-        seen = (sees[i, cell // 64] >> np.uint64(cell % 64)) & _ONE
+        seen = (sees[i, cell // 64] >> np.uint64(cell % 64)) & ONE
         if seen and np.hypot(points[cell, 0] - places[i, 0], points[cell, 2] - places[i, 2]) >= least_m:
             found[count] = i
             count += 1
@@ -204,31 +131,42 @@ def _further(towards, place, count):
 
 
 @njit(cache=True)
-def look(parent, place, camera, normals, sees, points, seen, fresh, gain):
-    """What n candidate views add: `fresh` `(n, words)` and `gain` `(n,)` are filled.
+def look(parent, place, pose, camera, sees, points, seen):
+    """What n candidate views add to what was seen.
 
-    `parent` `(n,)` is the row of `seen` that each candidate continues, `place` `(n,)` its place of the lattice.
+    Args:
+        parent: `(n,)` row of `seen` that each candidate continues.
+        place: `(n,)` the candidates' places.
+        pose: `(n, 4, 4)` camera_to_world, habitat axes.
+        camera: `rules.camera_numbers`.
+        sees: `(p, words)` cells that are not hidden from each place.
+        points: `(m, 3)` floor points of the cells, metres.
+        seen: `(k, words)` cells seen before.
+
+    Returns:
+        `(n, words)` the new cells, and `(n,)` how many they are.
     """
+    fresh, gain = np.zeros((len(parent), sees.shape[1]), np.uint64), np.zeros(len(parent), np.int64)
     for i in range(len(parent)):
-        missing = sees[place[i]] & ~seen[parent[i]]
-        fresh[i] = inside_frustum(missing, camera[i], normals[i], points)
-        total = 0
-        for word in fresh[i]:
-            total += _count(word)
-        gain[i] = total
+        for k in range(sees.shape[1]):
+            left = sees[place[i], k] & ~seen[parent[i], k]
+            while left:
+                bit = lowest(left)
+                left &= left - ONE
+                if in_image(*in_camera(pose[i], points[64 * k + bit]), camera):
+                    fresh[i, k] |= ONE << np.uint64(bit)
+                    gain[i] += 1
+    return fresh, gain
 
 
 @njit(cache=True)
-def outlook(parent, place, yaw, seen, fresh, wanted, reach, heading, near_turn, far_turn, left, pace):
+def outlook(place, yaw, unseen, reach, heading, near_turn, far_turn, left, pace):
     """`(n,)` what the cells not yet seen can still bring: for each, the views left once it could be in sight.
 
     Args:
-        parent: `(n,)` row of `seen`.
-        place: `(n,)` place of the lattice.
+        place: `(n,)` numbers of places.
         yaw: `(n,)` uint8, 256ths of a turn.
-        seen: `(k, words)` cells seen before.
-        fresh: `(n, words)` cells seen by the candidate view.
-        wanted: `(words,)` cells that can be seen at all.
+        unseen: `(n, words)` cells that can be seen at all and were not.
         reach: `(p, m)` of `reach_tables`.
         heading: `(p, m)` of `reach_tables`.
         near_turn: `(256,)` steps of turning until a cell at this difference of heading is in the image.
@@ -236,36 +174,30 @@ def outlook(parent, place, yaw, seen, fresh, wanted, reach, heading, near_turn, 
         left: views left after the candidate's.
         pace: steps counted for each step of the shortest way, because one walk cannot serve all cells.
     """
-    result = np.zeros(len(parent), np.float64)
-    for i in range(len(parent)):
-        at, total = place[i], 0.0
-        for k in range(len(wanted)):
-            word = wanted[k] & ~seen[parent[i], k] & ~fresh[i, k]
+    result = np.zeros(len(place), np.float64)
+    for i in range(len(place)):
+        at = place[i]
+        for k in range(unseen.shape[1]):
+            word = unseen[i, k]
             while word:
-                bit = _trailing(word)
-                word &= word - _ONE
-                half = reach[at, 64 * k + bit]
-                if half == NEVER:
-                    continue
-                turn = (int(heading[at, 64 * k + bit]) - int(yaw[i])) & 255
-                steps = 1.0 + 0.5 * half + (near_turn[turn] if half == 0 else far_turn[turn])
-                value = left - pace * steps
-                if value > 0:
-                    total += value
-        result[i] = total
+                cell = 64 * k + lowest(word)
+                word &= word - ONE
+                half = reach[at, cell]
+                if half != NEVER:
+                    turn = (int(heading[at, cell]) - int(yaw[i])) & 255
+                    steps = 1.0 + 0.5 * half + (near_turn[turn] if half == 0 else far_turn[turn])
+                    result[i] += max(left - pace * steps, 0.0)
     return result
 
 
 @njit(cache=True)
-def choose(order, key, parent, seen, fresh, width, per_key):
+def choose(order, key, seen, width, per_key):
     """Rows of the best candidates: at most `per_key` of one key, never two of one key that have seen the same.
 
     Args:
         order: `(n,)` rows, the best first.
         key: `(n,)` where a candidate stands and looks.
-        parent: `(n,)` row of `seen`.
-        seen: `(k, words)` cells seen before.
-        fresh: `(n, words)` cells seen by the candidate view.
+        seen: `(n, words)` cells that it has seen.
         width: largest number to keep.
         per_key: largest number to keep of one key.
     """
@@ -275,8 +207,8 @@ def choose(order, key, parent, seen, fresh, width, per_key):
         if used.get(key[i], 0) >= per_key:
             continue
         digest = np.uint64(key[i])
-        for k in range(fresh.shape[1]):
-            digest = (digest ^ (seen[parent[i], k] | fresh[i, k])) * np.uint64(0x9E3779B97F4A7C15)
+        for word in seen[i]:
+            digest = (digest ^ word) * np.uint64(0x9E3779B97F4A7C15)
             digest ^= digest >> np.uint64(29)
         if digest in states:
             continue

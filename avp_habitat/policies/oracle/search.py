@@ -6,13 +6,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.navigation.area import NavigableArea
-from avp_habitat.policies.oracle.lattice import Lattice, States, image_borders
+from avp_habitat.policies.oracle import kernels
+from avp_habitat.policies.oracle.places import ScenePlaces, new_views
 from avp_habitat.poses import wrap_angle
-from avp_habitat.task.motion import act, sensor_poses
+from avp_habitat.sight.bits import Bits
+from avp_habitat.task.motion import act
 from avp_habitat.task.settings import LOOK_DOWN, LOOK_UP, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, TaskSettings
 
 Float = NDArray[np.float64]
 _MOVES = np.array([MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, LOOK_UP, LOOK_DOWN])
+
+
+@dataclass(frozen=True)
+class States:
+    """n agents that have taken equally many views; every array's first axis is n."""
+
+    position: Float
+    """`(n, 3)` feet, metres."""
+    yaw: Float
+    """`(n,)` radians."""
+    pitch: Float
+    """`(n,)` radians."""
+    seen: Bits
+    """`(n, words)` sets of the observed cells."""
+    value: Float
+    """`(n,)` cells times views: what the new cells add to the area under the curve of observed cells over views."""
+
+
+def start_state(position: Float, seen: Bits, *, yaw: float, pitch: float) -> States:
+    """One agent at `(3,)` metres that has seen the bit set `(words,)`; angles in radians."""
+    return States(
+        np.asarray(position, dtype=np.float64)[None], np.array([yaw]), np.array([pitch]), seen[None].copy(), np.zeros(1)
+    )
 
 
 @dataclass(frozen=True)
@@ -29,7 +54,7 @@ class BeamSettings:
 
 
 def beam_search(
-    area: NavigableArea, lattice: Lattice, settings: TaskSettings, start: States, views: int, beam: BeamSettings
+    places: ScenePlaces, settings: TaskSettings, start: States, views: int, beam: BeamSettings
 ) -> NDArray[np.int64]:
     """The actions that make the area under the curve of coverage over views as large as the beam finds.
 
@@ -37,19 +62,18 @@ def beam_search(
     the agent turned and walked straight to where that cell is in sight.
 
     Args:
-        area: moves the agents.
-        lattice: of the scene.
+        places: of the scene.
         settings: of the task.
         start: one state.
         views: number of actions.
-        beam: width and hope.
+        beam: how widely to search.
 
     Returns:
         `(views,)` actions; never stop.
     """
     states, history = start, []
     for left in range(views - 1, -1, -1):
-        states, parent, action = _advance(area, lattice, settings, states, left, beam)
+        states, parent, action = _advance(places, settings, states, left, beam)
         history.append((parent, action))
     row = int(np.argmax(states.value))
     actions = []
@@ -60,40 +84,24 @@ def beam_search(
 
 
 def _advance(
-    area: NavigableArea, lattice: Lattice, settings: TaskSettings, states: States, left: int, beam: BeamSettings
+    places: ScenePlaces, settings: TaskSettings, states: States, left: int, beam: BeamSettings
 ) -> tuple[States, NDArray[np.int64], NDArray[np.int64]]:
     """The states after one more view, the rows that they come from, and the actions that lead to them."""
-    from avp_habitat.policies.oracle import kernels
-
-    parent, action, position, yaw, pitch = _moved(area, settings, states)
-    place = lattice.place_of(position)
-    pose = sensor_poses(settings, position, yaw, pitch)
-    fresh, gain = np.zeros((len(parent), len(lattice.wanted)), np.uint64), np.zeros(len(parent), np.int64)
-    camera, normals = np.ascontiguousarray(pose[:, :3, 3]), image_borders(pose, settings.intrinsics)
-    kernels.look(parent, place, camera, normals, lattice.sees, lattice.points, states.seen, fresh, gain)
+    parent, action, position, yaw, pitch = _moved(places.area, settings, states)
+    place = places.nearest(position)
+    fresh, gain = new_views(places, settings, parent, position, yaw, pitch, states.seen)
     value = states.value[parent] + (left + 1) * gain
-    near_turn, far_turn = _turning(settings)
+    heading = (np.round(yaw / (2 * np.pi) * 256).astype(np.int64) & 255).astype(np.uint8)
+    seen = states.seen[parent] | fresh
     hope = kernels.outlook(
-        parent,
-        place,
-        _in_256ths(yaw),
-        states.seen,
-        fresh,
-        lattice.wanted,
-        lattice.reach,
-        lattice.heading,
-        near_turn,
-        far_turn,
-        left,
-        beam.pace,
+        place, heading, places.wanted & ~seen, places.reach, places.heading, *_turning(settings), left, beam.pace
     )
     turn = np.round(wrap_angle(yaw) / np.radians(settings.turn_deg)).astype(np.int64)
     tilt = np.round(pitch / np.radians(settings.tilt_deg)).astype(np.int64)
     key = 1 + (place * 4096 + turn + 2048) * 4096 + tilt + 2048
     order = np.argsort(-(value + hope), kind="stable")
-    kept = kernels.choose(order, key, parent, states.seen, fresh, beam.width, beam.per_key)
-    seen = states.seen[parent[kept]] | fresh[kept]
-    return States(position[kept], yaw[kept], pitch[kept], seen, value[kept]), parent[kept], action[kept]
+    kept = kernels.choose(order, key, seen, beam.width, beam.per_key)
+    return States(position[kept], yaw[kept], pitch[kept], seen[kept], value[kept]), parent[kept], action[kept]
 
 
 def _moved(
@@ -108,10 +116,6 @@ def _moved(
     parent, action = parent[useful], action[useful]
     moved = act(area, settings, action, states.position[parent], states.yaw[parent], states.pitch[parent])
     return parent, action, *moved
-
-
-def _in_256ths(yaw: Float) -> NDArray[np.uint8]:
-    return (np.round(yaw / (2 * np.pi) * 256).astype(np.int64) & 255).astype(np.uint8)
 
 
 def _turning(settings: TaskSettings) -> tuple[Float, Float]:

@@ -1,4 +1,4 @@
-"""Greedy set cover over a lattice of poses, joined by shortest paths: the oracle's first plan."""
+"""Greedy set cover over a grid of poses, joined by shortest paths: the oracle's first plan."""
 
 from dataclasses import dataclass
 
@@ -7,34 +7,41 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from avp_habitat.navigation.area import NavigableArea
-from avp_habitat.policies.oracle.lattice import Lattice, States, views_from
+from avp_habitat.policies.oracle.places import ScenePlaces, views_from
+from avp_habitat.policies.oracle.search import States
 from avp_habitat.poses import wrap_angle
+from avp_habitat.sight.bits import Bits, gains
 from avp_habitat.task.motion import act
 from avp_habitat.task.settings import LOOK_DOWN, LOOK_UP, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, TaskSettings
 
-Bits = NDArray[np.uint64]
+Float = NDArray[np.float64]
+
+POSE_SPACING_M = 0.5
+"""Between the positions of the poses, metres."""
+HEADINGS = 12
+"""Of the poses at each position."""
+PITCHES_DEG = (0.0, -20.0, -40.0)
+"""Of the poses, degrees; those within the task's limit are used."""
+_AHEAD_M = 0.8
+_ARRIVED_M = 0.2
 
 
-def greedy_cover(sets: Bits, wanted: Bits, limit: int | None = None) -> list[int]:
+def greedy_cover(sets: Bits, wanted: Bits) -> list[int]:
     """Take the set that adds most, again and again, until nothing is added.
 
-    After k sets the cover is at least 1 - 1/e of the largest that any k sets reach (Nemhauser, Wolsey and Fisher
+    After any k sets the cover is at least 1 - 1/e of the largest that k sets reach (Nemhauser, Wolsey and Fisher
     1978, "An analysis of approximations for maximizing submodular set functions", proposition 4.3).
 
     Args:
         sets: `(n, words)` bit sets.
         wanted: `(words,)` the members that count.
-        limit: most sets to take; all that add something when left out.
 
     Returns:
         Numbers of the chosen sets in the order of choice; of equals the first.
     """
-    from avp_habitat.policies.oracle.kernels import gains
-
     chosen: list[int] = []
     missing = wanted.copy()
-    while len(sets) and (limit is None or len(chosen) < limit):
+    while len(sets):
         gain = gains(sets, missing)
         best = int(np.argmax(gain))
         if gain[best] == 0:
@@ -44,24 +51,12 @@ def greedy_cover(sets: Bits, wanted: Bits, limit: int | None = None) -> list[int
     return chosen
 
 
-Float = NDArray[np.float64]
-
-SPACING_M = 0.5
-"""Between the positions of the lattice of poses, metres."""
-HEADINGS = 12
-"""Of the poses at each position."""
-PITCHES_DEG = (0.0, -20.0, -40.0)
-"""Of the poses, degrees; those within the task's limit are used."""
-_AHEAD_M = 0.8
-_ARRIVED_M = 0.2
-
-
 @dataclass(frozen=True)
 class Poses:
     """q poses of cameras and what they see."""
 
     place: NDArray[np.int64]
-    """`(q,)` places of the lattice."""
+    """`(q,)` numbers of the places."""
     yaw: Float
     """`(q,)` radians."""
     pitch: Float
@@ -70,30 +65,27 @@ class Poses:
     """`(q, words)` cells that each pose observes."""
 
 
-def lattice_poses(lattice: Lattice, settings: TaskSettings, *, yaw: float) -> Poses:
+def all_poses(places: ScenePlaces, settings: TaskSettings, *, yaw: float) -> Poses:
     """Every combination of position, heading and pitch.
 
     Args:
-        lattice: of the scene.
+        places: of the scene.
         settings: of the task.
         yaw: one of the headings, radians; the agent's own makes them reachable.
     """
-    corner = np.floor(lattice.places[:, [0, 2]] / SPACING_M)
-    places = np.sort(np.unique(corner, axis=0, return_index=True)[1])
+    corner = np.floor(places.position[:, [0, 2]] / POSE_SPACING_M)
+    chosen = np.sort(np.unique(corner, axis=0, return_index=True)[1])
     turns = yaw + 2 * np.pi * np.arange(HEADINGS) / HEADINGS
     pitches = np.radians([pitch for pitch in PITCHES_DEG if abs(pitch) <= settings.pitch_limit_deg])
-    place, turn, pitch = (grid.ravel() for grid in np.meshgrid(places, wrap_angle(turns), pitches, indexing="ij"))
-    return Poses(place, turn, pitch, views_from(lattice, settings, lattice.places[place], turn, pitch))
+    place, turn, pitch = (grid.ravel() for grid in np.meshgrid(chosen, wrap_angle(turns), pitches, indexing="ij"))
+    return Poses(place, turn, pitch, views_from(places, settings, places.position[place], turn, pitch))
 
 
-def covering_tour(
-    area: NavigableArea, lattice: Lattice, settings: TaskSettings, start: States, views: int
-) -> NDArray[np.int64]:
+def covering_tour(places: ScenePlaces, settings: TaskSettings, start: States, views: int) -> NDArray[np.int64]:
     """Visit the poses of a greedy set cover, next the one that still adds most cells per step of the way to it.
 
     Args:
-        area: moves the agent.
-        lattice: of the scene.
+        places: of the scene.
         settings: of the task.
         start: one state.
         views: number of actions.
@@ -101,14 +93,12 @@ def covering_tour(
     Returns:
         `(views,)` actions; turns to the left when nothing is left to be seen.
     """
-    from avp_habitat.policies.oracle.kernels import gains
-
-    poses = lattice_poses(lattice, settings, yaw=float(start.yaw[0]))
-    chosen = np.array(greedy_cover(poses.sets, lattice.wanted & ~start.seen[0]), dtype=np.int64)
-    walk = _Walk(area, lattice, settings, start, views)
-    graph = _graph(lattice)
+    poses = all_poses(places, settings, yaw=float(start.yaw[0]))
+    chosen = np.array(greedy_cover(poses.sets, places.wanted & ~start.seen[0]), dtype=np.int64)
+    walk = _Walk(places, settings, start, views)
+    graph = _graph(places)
     while len(walk.actions) < views:
-        gain = gains(poses.sets[chosen], lattice.wanted & ~walk.seen)
+        gain = gains(poses.sets[chosen], places.wanted & ~walk.seen)
         chosen, gain = chosen[gain > 0], gain[gain > 0]
         steps = walk.steps_to(graph, poses, chosen)
         if not np.isfinite(steps).any():
@@ -120,27 +110,25 @@ def covering_tour(
     return np.array(walk.actions + [TURN_LEFT] * (views - len(walk.actions)), dtype=np.int64)
 
 
-def _graph(lattice: Lattice) -> csr_array:
+def _graph(places: ScenePlaces) -> csr_array:
     """`(p, p)` lengths in metres of the ways between neighbouring places."""
-    begin, slot = np.nonzero(lattice.neighbours >= 0)
-    entries = (lattice.lengths_m[begin, slot], (begin, lattice.neighbours[begin, slot]))
-    return csr_array(entries, shape=(len(lattice.places),) * 2)
+    begin, slot = np.nonzero(places.neighbours >= 0)
+    entries = (places.lengths_m[begin, slot], (begin, places.neighbours[begin, slot]))
+    return csr_array(entries, shape=(len(places.position),) * 2)
 
 
 class _Walk:
     """One agent's actions so far, and where they have led."""
 
-    def __init__(
-        self, area: NavigableArea, lattice: Lattice, settings: TaskSettings, start: States, views: int
-    ) -> None:
-        self._area, self._lattice, self._settings, self._views = area, lattice, settings, views
+    def __init__(self, places: ScenePlaces, settings: TaskSettings, start: States, views: int) -> None:
+        self._places, self._settings, self._views = places, settings, views
         self.position, self.yaw, self.pitch = start.position, start.yaw, start.pitch
         self.seen = start.seen[0].copy()
         self.actions: list[int] = []
 
     def steps_to(self, graph: csr_array, poses: Poses, chosen: NDArray[np.int64]) -> Float:
         """`(len(chosen),)` steps to poses, at least 1; not finite where no way leads."""
-        here = int(self._lattice.place_of(self.position)[0])
+        here = int(self._places.nearest(self.position)[0])
         settings = self._settings
         walking = dijkstra(graph, indices=here)[poses.place[chosen]] / settings.forward_m
         turning = np.abs(wrap_angle(poses.yaw[chosen] - self.yaw[0])) / np.radians(settings.turn_deg)
@@ -148,15 +136,15 @@ class _Walk:
         return np.maximum(walking + turning + tilting, 1.0)
 
     def go(self, graph: csr_array, goal: int) -> None:
-        """Walk to a place; gives up where the walls do not let the agent through as the lattice does."""
+        """Walk to a place; gives up where the walls do not let the agent through as the places do."""
         length, towards = dijkstra(graph, indices=goal, return_predecessors=True)
-        here = int(self._lattice.place_of(self.position)[0])
+        here = int(self._places.nearest(self.position)[0])
         patience = 3 * int(length[here] / self._settings.forward_m) + 36
         for _ in range(patience):
             if self._distance(goal) <= max(_ARRIVED_M, self._settings.forward_m / 2) or self._over:
                 return
             aim = self._ahead(towards, length)
-            offset = self._lattice.places[aim] - self.position[0]
+            offset = self._places.position[aim] - self.position[0]
             if not self._turn(float(np.arctan2(-offset[0], -offset[2]))):
                 self._act(MOVE_FORWARD)
 
@@ -174,11 +162,11 @@ class _Walk:
         return len(self.actions) >= self._views
 
     def _distance(self, place: int) -> float:
-        return float(np.linalg.norm((self._lattice.places[place] - self.position[0])[[0, 2]]))
+        return float(np.linalg.norm((self._places.position[place] - self.position[0])[[0, 2]]))
 
     def _ahead(self, towards: NDArray[np.integer], length: Float) -> int:
         """The place some way ahead on the shortest path from here."""
-        here = at = int(self._lattice.place_of(self.position)[0])
+        here = at = int(self._places.nearest(self.position)[0])
         while towards[at] >= 0 and length[here] - length[at] < _AHEAD_M:
             at = int(towards[at])
         return at
@@ -192,7 +180,7 @@ class _Walk:
         return True
 
     def _act(self, action: int) -> None:
-        state = act(self._area, self._settings, np.array([action]), self.position, self.yaw, self.pitch)
+        state = act(self._places.area, self._settings, np.array([action]), self.position, self.yaw, self.pitch)
         self.position, self.yaw, self.pitch = state
-        self.seen |= views_from(self._lattice, self._settings, *state)[0]
+        self.seen |= views_from(self._places, self._settings, *state)[0]
         self.actions.append(action)

@@ -9,9 +9,9 @@ from avp_habitat.scenes.builtin.noise import (
     Random,
     Size,
     blend,
-    coordinates,
     cosine_of_multiple,
     fractal,
+    grid,
     mix,
     plain,
     shade,
@@ -24,7 +24,7 @@ from avp_habitat.scenes.builtin.noise import (
 
 def _grain(rng: Random, size: Size, rings: float) -> Field:
     """`(height, width)` darkness of wood fibres that run along u, in [0, 1]."""
-    _, v = coordinates(size)
+    _, _, v = grid(*size)
     bend = fractal(rng, size, (5, 2), 3)
     ring = wave(v * np.float32(rings) + bend * 5)
     fibre = value_noise(rng, size, (size[0] // 2, 6))
@@ -39,8 +39,7 @@ def _ticks(rng: Random, size: Size) -> Field:
 
 def wood(rng: Random, colour: Colour) -> Picture:
     """A wooden face of 1.2 m x 0.6 m, grain along u, with a few knots."""
-    size = (256, 512)
-    u, v = coordinates(size)
+    size, u, v = grid(256, 512)
     dark = _grain(rng, size, 14) * 0.9
     for index in range(14):
         spread = 0.2 if index < 4 else 0.07
@@ -57,7 +56,7 @@ def wood(rng: Random, colour: Colour) -> Picture:
 def boards(rng: Random, colour: Colour, rows: int = 12) -> Picture:
     """A floor of staggered boards along u, 2.0 m x 1.67 m; every board has its own tone and grain."""
     size = (rows * 50, 720)
-    u, _ = coordinates(size)
+    _, u, _ = grid(*size)
     dark = _grain(rng, size, rows * 3)
     tone = np.ones(size, np.float32)
     gap = np.zeros(size, np.float32)
@@ -120,8 +119,7 @@ def paint(rng: Random, colour: Colour) -> Picture:
 
 def marble(rng: Random, colour: Colour, vein: Colour) -> Picture:
     """A polished slab with veins, 1.2 m x 1.2 m."""
-    size = (384, 384)
-    u, v = coordinates(size)
+    size, u, v = grid(384, 384)
     cloud = fractal(rng, size, (3, 3), 5)
     lines = wave(u * 2 + v + cloud * 4)
     fine = wave(u - v * 2 + fractal(rng, size, (4, 4), 5) * 5)
@@ -148,8 +146,7 @@ def _tile_motif(u: Field, v: Field, kind: int) -> Field:
 def tiles(rng: Random, colour: Colour, ink: Colour, *, patterned: bool) -> Picture:
     """A floor of 6 x 6 tiles of 0.25 m with joints, 1.5 m x 1.5 m; encaustic motifs when patterned."""
     count, side = 6, 96
-    size = (count * side, count * side)
-    u, v = coordinates(size)
+    size, u, v = grid(count * side, count * side)
     local_u, local_v = (u * count) % 1 * 2 - 1, (v * count) % 1 * 2 - 1
     tone = rng.array((count, count)) * np.float32(0.2) + np.float32(0.86)
     rgb = plain(size, colour)
@@ -200,8 +197,7 @@ def _motif(u: Field, v: Field, kind: int) -> Field:
 
 def wallpaper(rng: Random, colour: Colour, ink: Colour) -> Picture:
     """Printed wallpaper of half-drop motifs in two inks on textured paper, 1.2 m x 1.2 m."""
-    size = (512, 512)
-    u, v = coordinates(size)
+    size, u, v = grid(512, 512)
     repeats, kind = rng.choice((4, 6)), rng.integer(0, 3)
     rgb = plain(size, colour)
     for turn, share in ((0.0, 0.75), (0.5, 0.45)):
@@ -221,8 +217,7 @@ def wallpaper(rng: Random, colour: Colour, ink: Colour) -> Picture:
 def brick(rng: Random, colour: Colour) -> Picture:
     """A wall of bricks in running bond, 16 courses of 75 mm, 1.25 m x 1.2 m."""
     courses, across, side = 16, 5, 32
-    size = (courses * side, 540)
-    u, v = coordinates(size)
+    size, u, v = grid(courses * side, 540)
     course = np.floor(v * courses)
     shifted = u * across + np.float32(0.5) * (course % 2)
     local_u, local_v = shifted % 1, (v * courses) % 1
@@ -253,8 +248,7 @@ def brushed(rng: Random, colour: Colour) -> Picture:
 
 def wicker(rng: Random, colour: Colour) -> Picture:
     """Basket weave, 0.3 m x 0.3 m."""
-    size = (192, 192)
-    u, v = coordinates(size)
+    size, u, v = grid(192, 192)
     row = np.floor(v * 16)
     strand = wave(u * 6 + np.float32(0.5) * (row % 2))
     round_ = wave(v * 16)
@@ -264,8 +258,7 @@ def wicker(rng: Random, colour: Colour) -> Picture:
 
 def foliage(rng: Random, colour: Colour) -> Picture:
     """A leaf: midrib along v, side veins, blotches; spans one leaf."""
-    size = (160, 96)
-    u, v = coordinates(size)
+    size, u, v = grid(160, 96)
     across = np.abs(u - 0.5) * 2
     veins = np.clip(1 - wave(v * 8 - across * 1.6) * 5, 0, 1) * 0.5
     rib = step(-across, -0.08, 0.05)

@@ -85,10 +85,10 @@ def fractal(rng: Random, size: Size, cells: Size, octaves: int = 4, gain: float 
     return total / np.float32(sum_of_weights)
 
 
-def coordinates(size: Size) -> tuple[Field, Field]:
-    """`(height, width)` each: u to the right and v downwards in (0, 1), at pixel centres."""
-    v, u = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float32)
-    return (u + np.float32(0.5)) / np.float32(size[1]), (v + np.float32(0.5)) / np.float32(size[0])
+def grid(height: int, width: int) -> tuple[Size, Field, Field]:
+    """The size of a picture, and of its shape u to the right and v downwards in (0, 1), at pixel centres."""
+    v, u = np.mgrid[0:height, 0:width].astype(np.float32)
+    return (height, width), (u + np.float32(0.5)) / np.float32(width), (v + np.float32(0.5)) / np.float32(height)
 
 
 def plain(size: Size, colour: Colour) -> Field:

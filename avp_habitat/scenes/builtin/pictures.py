@@ -9,9 +9,9 @@ from avp_habitat.scenes.builtin.noise import (
     Random,
     Size,
     blend,
-    coordinates,
     cosine_of_multiple,
     fractal,
+    grid,
     mix,
     plain,
     shade,
@@ -35,7 +35,7 @@ def _brush(rng: Random, rgb: Field) -> Picture:
 
 
 def _discs(rng: Random, size: Size, colours: list[Colour]) -> Field:
-    u, v = coordinates(size)
+    _, u, v = grid(*size)
     rgb = mix(plain(size, colours[0]), colours[1], v)
     for _ in range(12):
         du, dv = (u - rng.uniform(0.1, 0.9)) * size[1] / size[0], v - rng.uniform(0.1, 0.9)
@@ -48,7 +48,7 @@ def _discs(rng: Random, size: Size, colours: list[Colour]) -> Field:
 
 
 def _blocks(rng: Random, size: Size, colours: list[Colour]) -> Field:
-    u, v = coordinates(size)
+    _, u, v = grid(*size)
     rgb = plain(size, blend(colours[0], (1, 1, 1), 0.6))
     for _ in range(22):
         left, top = int(rng.uniform(0.0, 0.9) * size[1]), int(rng.uniform(0.0, 0.9) * size[0])
@@ -62,7 +62,7 @@ def _blocks(rng: Random, size: Size, colours: list[Colour]) -> Field:
 
 
 def _hills(rng: Random, size: Size, colours: list[Colour]) -> Field:
-    u, v = coordinates(size)
+    _, u, v = grid(*size)
     rgb = mix(plain(size, blend(colours[1], (1, 1, 1), 0.5)), blend(colours[2], (1, 0.95, 0.85), 0.6), v)
     distance = np.sqrt((u - rng.uniform(0.2, 0.8)) ** 2 + (v - rng.uniform(0.15, 0.4)) ** 2)
     rgb = mix(rgb, colours[2], step(-distance, -0.11, 0.01))
@@ -75,7 +75,7 @@ def _hills(rng: Random, size: Size, colours: list[Colour]) -> Field:
 
 
 def _rays(rng: Random, size: Size, colours: list[Colour]) -> Field:
-    u, v = coordinates(size)
+    _, u, v = grid(*size)
     bend = fractal(rng, size, (3, 3), 4)
     turn = turn_of(u - rng.uniform(0.2, 0.8), v - rng.uniform(0.2, 0.8))
     field = turn * 10 + bend * 4
@@ -106,8 +106,7 @@ def _house(rng: Random, rgb: Field, u: Field, v: Field, left: float) -> Field:
 
 def view(rng: Random) -> Picture:
     """What lies outside the window: sky, hills, houses and trees; spans the whole window."""
-    size = (384, 512)
-    u, v = coordinates(size)
+    size, u, v = grid(384, 512)
     rgb = mix(plain(size, (0.62, 0.78, 0.95)), (0.95, 0.97, 1.0), np.clip(v * 1.9, 0, 1))
     rgb = mix(rgb, (1, 1, 1), np.clip(fractal(rng, size, (5, 3), 5) * 3 - 1.45, 0, 1) * (v < 0.6))
     for layer, colour in enumerate(((0.62, 0.72, 0.8), (0.5, 0.63, 0.55), (0.46, 0.6, 0.36))):
@@ -129,8 +128,7 @@ def view(rng: Random) -> Picture:
 
 def screen(rng: Random, colours: list[Colour]) -> Picture:
     """A switched-on screen with windows, text and a picture; spans the whole screen."""
-    size = (216, 384)
-    u, v = coordinates(size)
+    size, u, v = grid(216, 384)
     rgb = _hills(rng, size, colours)
     for left, top, right, bottom in ((0.06, 0.12, 0.5, 0.8), (0.55, 0.2, 0.93, 0.6), (0.58, 0.66, 0.9, 0.9)):
         inside = (u > left) & (u < right) & (v > top) & (v < bottom)
@@ -144,16 +142,14 @@ def screen(rng: Random, colours: list[Colour]) -> Picture:
 
 def film(rng: Random, colours: list[Colour]) -> Picture:
     """A landscape on a television, with a line of subtitles; spans the whole screen."""
-    size = (216, 384)
-    u, v = coordinates(size)
+    size, u, v = grid(216, 384)
     words = (value_noise(rng, size, (108, 90)) > 0.42) & (np.abs(v - 0.9) < 0.025) & (np.abs(u - 0.5) < 0.3)
     return to_picture(mix(_hills(rng, size, colours), (1, 1, 1), words.astype(np.float32)))
 
 
 def keys(rng: Random) -> Picture:
     """A keyboard with light letters; spans the whole keyboard."""
-    size = (96, 288)
-    u, v = coordinates(size)
+    size, u, v = grid(96, 288)
     key = (wave(u * 15) > 0.16) & (wave(v * 5) > 0.18)
     letters = key & (wave(u * 15) > 0.6) & (wave(v * 5) > 0.5) & (value_noise(rng, size, (48, 96)) > 0.45)
     rgb = mix(plain(size, (0.2, 0.2, 0.22)), (0.36, 0.36, 0.39), key.astype(np.float32))
@@ -169,7 +165,7 @@ def spine_cell(index: int) -> tuple[float, float, float, float]:
 
 
 def _spine(rng: Random, size: Size, colour: Colour) -> Field:
-    u, v = coordinates(size)
+    _, u, v = grid(*size)
     rgb = plain(size, colour) * (0.82 + 0.3 * wave(u * 0.999))[..., None]
     ink = rng.choice(((0.95, 0.9, 0.75), (0.1, 0.1, 0.1), (0.85, 0.7, 0.3), shade(colour, 1.8)))
     top = rng.uniform(0.08, 0.3)
@@ -198,7 +194,7 @@ def spines(rng: Random, colours: list[Colour]) -> Picture:
 
 def _threads(rng: Random, size: Size, pitch: int) -> Field:
     """`(height, width)` light of a plain weave with `pitch` pixels per thread and uneven yarn."""
-    u, v = coordinates(size)
+    _, u, v = grid(*size)
     across, down = size[1] // pitch, size[0] // pitch
     column, row = np.floor(u * across), np.floor(v * down)
     over = (column + row) % 2
@@ -251,8 +247,7 @@ PATTERNS = (_stripes, _plaid, _chevrons, _ikat, _sprigs)
 
 def printed(rng: Random, colours: list[Colour]) -> Picture:
     """Cloth of three colours with one of several repeating patterns, 0.6 m x 0.6 m."""
-    size = (320, 320)
-    u, v = coordinates(size)
+    size, u, v = grid(320, 320)
     first, second = rng.choice(PATTERNS)(u, v)
     rgb = mix(mix(plain(size, colours[0]), colours[1], first * 0.9), colours[2], second * 0.9)
     return to_picture(rgb * (_threads(rng, size, 4) * 1.15)[..., None])
@@ -277,7 +272,7 @@ def rug(rng: Random, colours: list[Colour], width_m: float, depth_m: float) -> P
         depth_m: extent along v in metres.
     """
     size = (int(depth_m * 220), int(width_m * 220))
-    u, v = coordinates(size)
+    _, u, v = grid(*size)
     x, y = np.abs(u - 0.5) * np.float32(width_m), np.abs(v - 0.5) * np.float32(depth_m)
     rim_x, rim_y = np.float32(width_m / 2) - x, np.float32(depth_m / 2) - y
     pitch = rng.choice((2.5, 3.0, 4.0))
@@ -299,8 +294,7 @@ def rug(rng: Random, colours: list[Colour], width_m: float, depth_m: float) -> P
 def bedding(rng: Random, colours: list[Colour]) -> Picture:
     """A quilt of squares with printed patches, 1.2 m x 1.2 m."""
     count, side = 6, 80
-    size = (count * side, count * side)
-    u, v = coordinates(size)
+    size, u, v = grid(count * side, count * side)
     first, second = rng.choice(PATTERNS)(u * 2, v * 2)
     rgb = plain(size, shade(colours[0], 1.05))
     patch = ((np.floor(u * count) + np.floor(v * count)) % 2).astype(np.float32)

@@ -1,158 +1,27 @@
-"""Furnished rooms that are made up from a number: `builtin:SEED`."""
+"""Furnished rooms that are made up from a number, `builtin:SEED`, with light baked into their vertices."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from avp_habitat.errors import UsageError
-from avp_habitat.scenes.builtin import decor, groups, seating
-from avp_habitat.scenes.builtin.floorplan import Floor, Placed, places, stand_at
-from avp_habitat.scenes.builtin.groups import Arrange, Member
-from avp_habitat.scenes.builtin.kit import Kit, Piece, shifted
-from avp_habitat.scenes.builtin.lighting import bake
+from avp_habitat.scenes.builtin.furnish import Placed, furnish
+from avp_habitat.scenes.builtin.kit import Kit, Lamp
 from avp_habitat.scenes.builtin.noise import Random
-from avp_habitat.scenes.builtin.shapes import Surface, joined
-from avp_habitat.scenes.builtin.shell import Shell, Wall, build_shell, plan_shell
+from avp_habitat.scenes.builtin.shapes import Float, Surface, joined
+from avp_habitat.scenes.builtin.shell import Shell, build_shell, plan_shell
 from avp_habitat.scenes.mesh import TexturedMesh, merge
 
 GENERATOR_VERSION = 1
 """Rises whenever a seed's room changes, so that results name the room that they were measured in."""
-_PICTURES = ((0.9, 0.65), (0.5, 0.7), (0.6, 0.85), (0.7, 0.5), (1.2, 0.8))
-"""Widths and heights of frames in metres."""
-_MIDDLE_M = 1.6
-"""Height at which the middle of a picture hangs."""
-_MAIN, _EXTRA, _SMALL = 0.45, 0.42, 0.41
-"""Share of the floor that stays walkable after placing main groups, storage, and what fills corners."""
-_Spot = tuple[Wall, float, float]
-"""A wall, metres along it and metres in front of it."""
-
-
-def _hang_one(floor: Floor, rng: Random, kit: Kit, wall: Wall, right: float, *, clock: bool) -> bool:
-    """Hang a picture or clock at a place on a wall if nothing is in its way."""
-    width, height = (0.34, 0.34) if clock else rng.choice(_PICTURES)
-    low, high = _MIDDLE_M - height / 2, _MIDDLE_M + height / 2
-    stand = stand_at(Member(Piece("", [], width, 0.06, high), 0.0, 0.03), wall, right, 0.0)
-    if not floor.is_free(stand, low, high, 0.1):
-        return False
-    surfaces = decor.clock(kit) if clock else decor.picture(kit, rng, width, height)
-    kind = "clock" if clock else "picture"
-    piece = Piece(kind, shifted(surfaces, 0.0, _MIDDLE_M, -0.03), width, 0.06, high)
-    floor.hang(replace(stand, piece=piece), low, high)
-    return True
-
-
-def _hang_pictures(floor: Floor, rng: Random, kit: Kit) -> None:
-    """Pictures on every wall that has room for them, one clock in some rooms."""
-    clock = rng.chance(0.6)
-    for wall in rng.shuffled(floor.shell.walls):
-        wanted = 3 if wall.length > 3 else 1
-        for right in rng.shuffled(places(0.5, wall.length - 0.4, 0.2)):
-            if wanted and _hang_one(floor, rng, kit, wall, right, clock=clock):
-                wanted, clock = wanted - 1, False
-
-
-def _hang_lamp(floor: Floor, rng: Random, kit: Kit) -> None:
-    """A pendant above the dining table, or where the room is open."""
-    ceiling, (x0, z0, x1, z1) = floor.shell.ceiling, floor.shell.bounds
-    tables = [stand.position for stand in floor.placed if stand.piece.kind == "dining table"]
-    bottom = min(2.1, round(ceiling - 0.62, 2))
-    piece = decor.pendant(kit, rng, ceiling, bottom)
-    half = piece.width / 2
-    for x, z in tables or [((x0 + x1) / 2 + 0.1, (z0 + z1) / 2), (x0 + 1.2, z0 + 1.2), (x1 - 1.2, z1 - 1.2)]:
-        stand = Placed(piece, np.eye(3), (x, z), (x - half, z - half, x + half, z + half))
-        if floor.is_free(stand, bottom - 0.05, ceiling, 0.03):
-            floor.hang(stand, bottom - 0.05, ceiling)
-            return
-
-
-def _put(floor: Floor, arrange: Arrange, spots: Iterable[_Spot], least_share: float) -> bool:
-    """Place a group at the first spot where it fits and leaves enough of the floor walkable."""
-    for wall, right, inwards in spots:
-        group = arrange(floor.shell.depth_at(wall, right) - inwards)
-        if group is not None and floor.try_group(group, wall, right, inwards, least_share=least_share):
-            return True
-    return False
-
-
-def _at_walls(floor: Floor, rng: Random) -> Iterator[_Spot]:
-    """Places along all walls in random order."""
-    for wall in rng.shuffled(floor.shell.walls):
-        for right in rng.shuffled(places(0.3, wall.length - 0.3, 0.2)):
-            yield wall, right, 0.0
-
-
-def _in_corners(floor: Floor, rng: Random, distance: float) -> Iterator[_Spot]:
-    """Places at walls, a distance in metres from their ends, in random order."""
-    for wall in rng.shuffled(floor.shell.walls):
-        for right in rng.shuffled([distance, wall.length - distance]):
-            yield wall, right, 0.0
-
-
-def _anywhere(floor: Floor, rng: Random) -> Iterator[_Spot]:
-    """Places in the open floor in random order."""
-    for wall in rng.shuffled(floor.shell.walls):
-        spots = [(r, i) for r in places(0.6, wall.length - 0.5, 0.3) for i in places(0.1, 4.0, 0.3)]
-        for right, inwards in rng.shuffled(spots)[:120]:
-            yield wall, right, inwards
-
-
-def _across(floor: Floor, rng: Random) -> Iterator[_Spot]:
-    """Places at long walls, away from their ends, in random order."""
-    for wall in rng.shuffled([wall for wall in floor.shell.walls if wall.length >= 3.0]):
-        for share in rng.shuffled([0.3, 0.36, 0.43, 0.5, 0.57, 0.64, 0.7]):
-            yield wall, round(wall.length * share, 2), 0.0
-
-
-def _storage(kit: Kit, rng: Random) -> list[Arrange]:
-    """Tall and low furniture for walls, the second shelf and chest last."""
-    kinds = ((decor.bookshelf, 0.55), (decor.wardrobe, 0.6), (decor.drawers, 0.5))
-    first = [groups.against_wall(make(kit, rng), clear) for make, clear in kinds]
-    second = [groups.against_wall(make(kit, rng), clear) for make, clear in kinds[::2]]
-    return rng.shuffled(first) + second
-
-
-def _put_living(floor: Floor, rng: Random, kit: Kit) -> bool:
-    """Sofa, television and what belongs to them, as much as fits."""
-    return any(_put(floor, arrange, _at_walls(floor, rng), _MAIN) for arrange in groups.living(kit, rng))
-
-
-def _put_main_groups(floor: Floor, rng: Random, kit: Kit) -> None:
-    """What the room is for, by its size, and what parts it."""
-    area = floor.shell.floor_area
-    sleeps = rng.chance(0.6 if area > 22 else 0.4)
-    sits = area > 20 or not sleeps
-    sits = sits and _put_living(floor, rng, kit)
-    sleeps = (sleeps or not sits) and _put(floor, groups.sleeping(kit, rng), _at_walls(floor, rng), _MAIN)
-    if not sits and not sleeps:
-        sits = _put_living(floor, rng, kit)
-    if not (sits and sleeps) or area > 30:
-        _put(floor, groups.dining(kit, rng), _anywhere(floor, rng), _MAIN)
-    any(_put(floor, arrange, _across(floor, rng), _MAIN) for arrange in groups.divider(kit, rng, floor.shell.ceiling))
-
-
-def _put_the_rest(floor: Floor, rng: Random, kit: Kit) -> None:
-    """Desk, storage, a place to read, and what fills corners, as long as the floor stays walkable."""
-    first, *rest = _storage(kit, rng)
-    for arrange in (groups.working(kit, rng), first):
-        _put(floor, arrange, _at_walls(floor, rng), _EXTRA)
-    any(_put(floor, arrange, _at_walls(floor, rng), _EXTRA) for arrange in groups.reading(kit, rng))
-    for arrange in rest:
-        _put(floor, arrange, _at_walls(floor, rng), _EXTRA)
-    for _ in range(2):
-        _put(floor, groups.against_wall(decor.plant(kit, rng), 0.0), _in_corners(floor, rng, 0.42), _SMALL)
-    if sum(stand.piece.kind == "side table" for stand in floor.placed) < 2:
-        _put(floor, groups.against_wall(seating.side_table(kit, rng), 0.3), _at_walls(floor, rng), _SMALL)
-
-
-def furnish(shell: Shell, rng: Random, kit: Kit) -> list[Placed]:
-    """Furniture of a room, none of it in another's place, the door free, the floor walkable and in one part."""
-    floor = Floor(shell)
-    _put_main_groups(floor, rng, kit)
-    _put_the_rest(floor, rng, kit)
-    _hang_lamp(floor, rng, kit)
-    _hang_pictures(floor, rng, kit)
-    return floor.placed
+_VOXEL_M = 0.1
+_PADDING = 8
+"""Voxels around the room that count as solid."""
+_OFF_THE_GRID = 3.7e-5
+"""Metres by which voxels are shifted, so that no wall lies exactly between two of them."""
 
 
 def plan_room(seed: int) -> tuple[Kit, Shell, list[Placed]]:
@@ -206,5 +75,110 @@ def generate_room(seed: int) -> TexturedMesh:
         surfaces += stand.surfaces()
     lamps = [lamp for stand in placed for lamp in stand.lamps()]
     surfaces = [replace(s, vertices=_snapped(s.vertices), uv=_snapped(s.uv)) for s in joined(surfaces)]
-    colours = bake(shell, surfaces, lamps)
+    colours = _bake(shell, surfaces, lamps)
     return merge([_mesh(surface, colour) for surface, colour in zip(surfaces, colours, strict=True)])
+
+
+class _Voxels:
+    """What of the room's space is filled, and how filled the surroundings of each place are."""
+
+    def __init__(self, shell: Shell, surfaces: list[Surface]) -> None:
+        """Fill every voxel that a surface passes through and everything outside the room."""
+        x0, z0, x1, z1 = shell.bounds
+        self._origin = np.array([x0, 0.0, z0]) - _PADDING * _VOXEL_M - _OFF_THE_GRID
+        extent = np.array([x1 - x0, shell.ceiling, z1 - z0])
+        shape = tuple(int(n) for n in np.ceil(extent / _VOXEL_M) + 2 * _PADDING)
+        filled = np.ones(shape, np.float32)
+        inside = [np.arange(n) * _VOXEL_M + _VOXEL_M / 2 - _PADDING * _VOXEL_M for n in shape]
+        room = [(along > 0) & (along < extent[axis]) for axis, along in enumerate(inside)]
+        filled[np.ix_(*room)] = 0
+        if shell.notch is not None:
+            a, b, c, d = shell.notch
+            x, z = inside[0] + x0, inside[2] + z0
+            filled[np.ix_((x > a) & (x < c), room[1], (z > b) & (z < d))] = 1
+        self.solid = filled
+        for surface in surfaces:
+            index = self._index(_samples(surface))
+            filled[index[:, 0], index[:, 1], index[:, 2]] = 1
+        self.soft = {reach: uniform_filter(filled, 2 * reach + 1, mode="nearest") for reach in (1, 2, 4, 7)}
+
+    def _index(self, points: Float) -> NDArray[np.int64]:
+        index = np.floor((points - self._origin) / _VOXEL_M).astype(np.int64)
+        return np.clip(index, 0, np.array(self.solid.shape) - 1)
+
+    def fullness(self, points: Float, reach: int) -> NDArray[np.float32]:
+        """Trilinear share of filled space within `reach` voxels of `(n, 3)` points."""
+        grid = self.soft[reach]
+        place = np.clip((points - self._origin) / _VOXEL_M - 0.5, 0, np.array(grid.shape) - 1.001)
+        low = np.floor(place).astype(np.int64)
+        part = (place - low).astype(np.float32)
+        total = np.zeros(len(points), np.float32)
+        for corner in range(8):
+            bits = np.array([corner >> 2 & 1, corner >> 1 & 1, corner & 1])
+            weight = np.prod(np.where(bits, part, 1 - part), axis=1)
+            at = low + bits
+            total += weight * grid[at[:, 0], at[:, 1], at[:, 2]]
+        return total
+
+    def clear_view(self, points: Float, light: Float, steps: int = 14) -> NDArray[np.float32]:
+        """Share of light that reaches `(n, 3)` points from a `(3,)` point past what is filled."""
+        grid = self.soft[1]
+        through = np.ones(len(points), np.float32)
+        for step in range(1, steps):
+            at = self._index(points + (light - points) * (step / steps))
+            through *= 1 - 0.55 * grid[at[:, 0], at[:, 1], at[:, 2]]
+        return through
+
+
+def _samples(surface: Surface) -> Float:
+    """Points on the triangles, close enough together to fill every voxel that they pass through."""
+    corners = surface.vertices[surface.triangles]
+    weights = np.array([[i, j, 4 - i - j] for i in range(5) for j in range(5 - i)]) / 4
+    return np.einsum("kc,tcd->tkd", weights, corners).reshape(-1, 3)
+
+
+def _open_sky(voxels: _Voxels, points: Float, normals: Float) -> NDArray[np.float32]:
+    """How unobstructed the half space above each point is, 0 to 1."""
+    openness = np.ones(len(points), np.float32)
+    for reach, weight in ((1, 0.22), (2, 0.3), (4, 0.32), (7, 0.34)):
+        openness -= np.float32(weight) * voxels.fullness(points + normals * (reach + 0.6) * _VOXEL_M, reach)
+    return np.clip(openness, 0.3, 1)
+
+
+def _from_lamp(voxels: _Voxels, points: Float, normals: Float, position: Float, reach: float) -> NDArray[np.float32]:
+    """Light of a point source: falls off with distance and slant, shadowed softly."""
+    offset = position - points
+    square = (offset * offset).sum(axis=1)
+    slant = (offset * normals).sum(axis=1) / np.sqrt(square + 1e-6)
+    falloff = np.clip(slant * 0.8 + 0.2, 0, 1) / (1 + square / reach**2)
+    return (falloff * voxels.clear_view(points + normals * 1.6 * _VOXEL_M, position)).astype(np.float32)
+
+
+def _windows(shell: Shell) -> Iterator[tuple[Float, float]]:
+    """Points of light just inside each window and their strength."""
+    for hole in shell.openings:
+        if hole.kind == "window":
+            wall, width = shell.walls[hole.wall], hole.right - hole.left
+            for share in (0.25, 0.75):
+                x, z = wall.point(hole.left + width * share, 0.3)
+                yield np.array([x, (hole.bottom + hole.top) / 2 + 0.2, z]), 0.3 * width
+
+
+def _bake(shell: Shell, surfaces: list[Surface], lamps: list[Lamp]) -> list[NDArray[np.float32]]:
+    """`(v, 3)` light in [0, 1] on each surface, from windows and lamps; all is in the world frame."""
+    voxels = _Voxels(shell, surfaces)
+    points, normals = (np.concatenate([getattr(each, name) for each in surfaces]) for name in ("vertices", "normals"))
+    openness = _open_sky(voxels, points, normals)
+    ambient = openness * (0.76 + 0.05 * normals[:, 1]).astype(np.float32)
+    light = ambient[:, None] * np.array([1.0, 0.99, 0.97], np.float32)
+    for position, strength in _windows(shell):
+        daylight = _from_lamp(voxels, points, normals, position, 2.4) * np.float32(strength)
+        light += daylight[:, None] * np.array([0.97, 1.0, 1.04], np.float32)
+    for lamp in lamps:
+        warm = _from_lamp(voxels, points, normals, np.asarray(lamp.position), 0.9) * np.float32(lamp.strength)
+        light += warm[:, None] * np.array([1.05, 0.92, 0.7], np.float32)
+    light = np.where(light > 0.8, 0.8 + (light - 0.8) * 0.45, light)
+    parts = np.split(np.clip(light, 0, 1), np.cumsum([len(surface.vertices) for surface in surfaces])[:-1])
+    return [
+        np.ones_like(part) if surface.material.glows else part for surface, part in zip(surfaces, parts, strict=True)
+    ]

@@ -14,7 +14,7 @@ Float = NDArray[np.floating]
 Vector = tuple[float, float, float]
 Rectangle = tuple[float, float, float, float]
 HALF_TURN = 3.14159265
-"""Radians; the rooms of old keep this many digits of it."""
+"""Radians, with as many digits as the first rooms were made with."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 """Surfaces of the empty room: floor, ceiling, walls, windows, door, curtains."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -147,15 +147,12 @@ def plan_shell(rng: Random) -> Shell:
     corners, notch = _outline(rng)
     ceiling = rng.uniform(2.5, 3.2)
     shell = Shell(corners, notch, ceiling, ())
-    walls = shell.walls
-    order = rng.shuffled([index for index, wall in enumerate(walls) if wall.length >= 2.4])
-    door_wall = walls[order[0]]
-    left = 0.3 if rng.chance(0.5) else round(door_wall.length - 1.2, 2)
-    openings = [Opening(order[0], left, round(left + 0.9, 2), 0.0, 2.05, "door")]
+    first, *others = rng.shuffled([index for index, wall in enumerate(shell.walls) if wall.length >= 2.4])
+    left = 0.3 if rng.chance(0.5) else round(shell.walls[first].length - 1.2, 2)
+    openings = [Opening(first, left, round(left + 0.9, 2), 0.0, 2.05, "door")]
     windows = rng.integer(1, 2) if shell.floor_area < 24 else rng.integer(2, 3)
-    for index in order[1 : 1 + windows]:
-        openings.append(_window(rng, index, walls[index].length, ceiling))
-    return Shell(corners, notch, ceiling, tuple(openings))
+    openings += [_window(rng, index, shell.walls[index].length, ceiling) for index in others[:windows]]
+    return replace(shell, openings=tuple(openings))
 
 
 def _floor_and_ceiling(kit: Kit, shell: Shell) -> list[Surface]:
@@ -242,11 +239,8 @@ def curtain_bottom(shell: Shell, hole: Opening) -> float:
 
 
 def _skirting(kit: Kit, wall: Wall, holes: list[Opening]) -> list[Surface]:
-    edges = [0.0]
-    for hole in holes:
-        if hole.kind == "door":
-            edges += [hole.left - 0.08, hole.right + 0.08]
-    edges.append(wall.length)
+    beside = [edge for hole in holes if hole.kind == "door" for edge in (hole.left - 0.08, hole.right + 0.08)]
+    edges = [0.0, *beside, wall.length]
     made = []
     for left, right in zip(edges[::2], edges[1::2], strict=True):
         if right - left > 0.02:

@@ -15,7 +15,7 @@ from avp_habitat.navigation.settings import NavigationSettings
 from avp_habitat.poses import Intrinsics, camera_to_world
 from avp_habitat.scenes.loader import identify
 from avp_habitat.scenes.location import Frame, SceneLocation, locate
-from avp_habitat.sight.coverage import visible_in_depth
+from avp_habitat.sight.rules import visible_in_depth
 from avp_habitat.simulators.base import Frames
 from avp_habitat.simulators.habitat import process
 from avp_habitat.simulators.habitat.engine import HabitatEngine, OverheadCamera

@@ -1,106 +1,30 @@
-"""A table with a row for every place of a lattice, growing tile by tile with the places that are asked for."""
+"""Columns with a row for every place of a lattice over the floor, growing tile by tile where agents come."""
 
 import hashlib
 import io
 import os
-import tempfile
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from avp_habitat.files import atomic_file
 from avp_habitat.navigation.area import NavigableArea
 
-ENVIRONMENT = "AVP_CACHE"
+Columns = Mapping[str, NDArray]
+
+CACHE_VARIABLE = "AVP_CACHE"
 """Environment variable that names the folder of the cache; empty keeps nothing on disk."""
-
-_DIGEST_BYTES = 32
-
-
-def cache_folder() -> Path | None:
-    """Where tables are kept: `$AVP_CACHE`, else `avp` in the user's cache folder.
-
-    Returns:
-        None when `$AVP_CACHE` is empty, or the user has no home, as in some containers.
-    """
-    chosen = os.environ.get(ENVIRONMENT)
-    if chosen is not None:
-        return Path(chosen) if chosen else None
-    caches = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
-    return caches / "avp" if caches.is_absolute() else None
-
-
-class TileFiles:
-    """The files of one scene's tables: an unsound one is made anew, one that cannot be written costs a warning.
-
-    Each is an `.npz` with the SHA-256 behind it of what it should be (scene, tile, points, columns) and what it holds.
-    """
-
-    def __init__(self, name: str) -> None:
-        """Use the folder `name` of the cache."""
-        self._name = name
-        folder = cache_folder()
-        self._folder = None if folder is None else folder / "tables" / name
-
-    def read(
-        self, tile: tuple[int, int], points: NDArray[np.integer], like: Mapping[str, NDArray]
-    ) -> dict[str, NDArray] | None:
-        """A tile's tables by name, or None where there is no sound file for these `(k, 2)` points and columns."""
-        if self._folder is None:
-            return None
-        try:
-            data = self._path(self._folder, tile).read_bytes()
-        except OSError:
-            return None
-        content, digest = data[:-_DIGEST_BYTES], data[-_DIGEST_BYTES:]
-        if digest != self._digest(tile, points, like, content):
-            return None
-        with np.load(io.BytesIO(content)) as file:
-            return {name: file[name] for name in like}
-
-    def write(self, tile: tuple[int, int], points: NDArray[np.integer], columns: Mapping[str, NDArray]) -> None:
-        """Keep a tile; a full or read-only disk costs a warning."""
-        if self._folder is None:
-            return
-        buffer = io.BytesIO()
-        arrays: dict[str, Any] = dict(columns)
-        np.savez(buffer, **arrays)
-        content = buffer.getvalue()
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            # Another process may write the same tile: each writes its own file, and the last rename wins.
-            with tempfile.NamedTemporaryFile(dir=self._folder, suffix=".part", delete=False) as file:
-                try:
-                    file.write(content + self._digest(tile, points, columns, content))
-                    file.close()
-                    os.replace(file.name, self._path(self._folder, tile))
-                except BaseException:
-                    os.unlink(file.name)
-                    raise
-        except OSError as error:
-            warnings.warn(f"{self._folder}: tables are not kept: {error}", stacklevel=2)
-            self._folder = None
-
-    def _digest(
-        self, tile: tuple[int, int], points: NDArray[np.integer], columns: Mapping[str, NDArray], content: bytes
-    ) -> bytes:
-        layout = [(name, column.dtype.str, column.shape[1:]) for name, column in columns.items()]
-        return hashlib.sha256(f"{self._name} {tile} {layout}".encode() + points.tobytes() + content).digest()
-
-    @staticmethod
-    def _path(folder: Path, tile: tuple[int, int]) -> Path:
-        return folder / f"tile_{tile[0]}_{tile[1]}.npz"
-
-
 TILE = 16
 """Lattice points along a tile's side; a tile is the piece that is computed and kept at a time."""
-
 MARGIN_M = 0.08
 """Less than an agent's radius: a camera this far outside of the area is still before the wall."""
+
+_DIGEST_BYTES = 32
+_PLACES_PER_CALL = 64
 
 
 @dataclass(frozen=True)
@@ -157,7 +81,7 @@ class Lattice:
         return grid[self._near_floor()[grid[:, 0], grid[:, 1]]]
 
     def _near_floor(self) -> NDArray[np.bool_]:
-        """Which lattice points have the centre of a navigable cell less than a spacing and a cell away, each way."""
+        """`shape` which points have the centre of a navigable cell less than a spacing and a cell away, each way."""
         near = np.zeros(self.shape, dtype=np.bool_)
         row, column = np.nonzero(self.area.mask)
         at = (np.stack([column, row], axis=1) + 0.5) * self.area.cell_m
@@ -171,37 +95,90 @@ class Lattice:
         return near
 
 
-_PLACES_PER_CALL = 64
+def cache_folder() -> Path | None:
+    """Where tables are kept: `$AVP_CACHE`, else `avp` in the user's cache folder.
+
+    Returns:
+        None when `$AVP_CACHE` is empty, or the user has no home, as in some containers.
+    """
+    chosen = os.environ.get(CACHE_VARIABLE)
+    if chosen is not None:
+        return Path(chosen) if chosen else None
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+    return caches / "avp" if caches.is_absolute() else None
 
 
-def words_for(bits: int) -> int:
-    """Words of 64 bits that hold so many bits."""
-    return -(-bits // 64)
+class TileFiles:
+    """The files of one table: an unsound one is made anew, one that cannot be written costs a warning.
+
+    Each is an `.npz` with the SHA-256 behind it of what it should be (table, tile, points, columns) and what it holds.
+    """
+
+    def __init__(self, name: str) -> None:
+        """Use the folder `name` of the cache."""
+        self._name = name
+        folder = cache_folder()
+        self._folder = None if folder is None else folder / "tables" / name
+
+    def read(self, tile: tuple[int, int], points: NDArray[np.integer], like: Columns) -> dict[str, NDArray] | None:
+        """A tile's columns, or None where there is no sound file for these `(k, 2)` points and columns."""
+        if self._folder is None:
+            return None
+        try:
+            data = _path(self._folder, tile).read_bytes()
+        except OSError:
+            return None
+        content, digest = data[:-_DIGEST_BYTES], data[-_DIGEST_BYTES:]
+        if digest != self._digest(tile, points, like, content):
+            return None
+        with np.load(io.BytesIO(content)) as file:
+            return {name: file[name] for name in like}
+
+    def write(self, tile: tuple[int, int], points: NDArray[np.integer], columns: Columns) -> None:
+        """Keep a tile; a full or read-only disk costs a warning."""
+        if self._folder is None:
+            return
+        buffer = io.BytesIO()
+        np.savez(buffer, **columns)  # type: ignore[arg-type]
+        content = buffer.getvalue()
+        try:
+            with atomic_file(_path(self._folder, tile)) as partial:
+                partial.write_bytes(content + self._digest(tile, points, columns, content))
+        except OSError as error:
+            warnings.warn(f"{self._folder}: tables are not kept: {error}", stacklevel=2)
+            self._folder = None
+
+    def _digest(self, tile: tuple[int, int], points: NDArray[np.integer], columns: Columns, content: bytes) -> bytes:
+        layout = [(name, column.dtype.str, column.shape[1:]) for name, column in columns.items()]
+        return hashlib.sha256(f"{self._name} {tile} {layout}".encode() + points.tobytes() + content).digest()
 
 
-class PlaceRows:
+def _path(folder: Path, tile: tuple[int, int]) -> Path:
+    return folder / f"tile_{tile[0]}_{tile[1]}.npz"
+
+
+class PlaceTable:
     """The rows of the places asked for so far; whole tiles of them are kept on disk."""
 
     def __init__(
-        self,
-        lattice: Lattice,
-        files: TileFiles,
-        empty: dict[str, NDArray],
-        compute: Callable[[NDArray[np.floating]], dict[str, NDArray]],
+        self, lattice: Lattice, name: str, empty: Columns, compute: Callable[[NDArray[np.floating]], Columns]
     ) -> None:
         """Make an empty table.
 
         Args:
             lattice: the places.
-            files: where finished tiles lie.
+            name: of its files: a digest of all that the columns follow from.
             empty: each column by name, without rows.
             compute: the columns of `(k, 3)` feet, metres.
         """
+        self.lattice = lattice
+        """The places."""
         self.columns = dict(empty)
         """By name; the first axis of each is the slot."""
+        self.name = name
+        """Of its files."""
+        self._files = TileFiles(name)
         self._empty = empty
-        self._lattice = lattice
-        self._files = files
         self._compute = compute
         self._slot = np.full(lattice.shape, -1, dtype=np.int32)
         self._slots = 0
@@ -216,7 +193,7 @@ class PlaceRows:
         Returns:
             `(k, 4)` slots and `(k, 4)` weights that sum to 1.
         """
-        points, weight = self._lattice.around(position)
+        points, weight = self.lattice.around(position)
         slots = self._slot[points[..., 0], points[..., 1]]
         if (slots < 0).any():
             self._make(points[slots < 0])
@@ -226,7 +203,7 @@ class PlaceRows:
     def _make(self, points: NDArray[np.integer]) -> None:
         for tile in sorted({(int(i), int(j)) for i, j in points // TILE} - self._tiles):
             self._tiles.add(tile)
-            wanted = self._lattice.points_of_tile(tile)
+            wanted = self.lattice.points_of_tile(tile)
             rows = self._files.read(tile, wanted, self._empty)
             if rows is None:
                 rows = self._rows_of(wanted)
@@ -237,15 +214,14 @@ class PlaceRows:
         if len(lacking):
             self._add(lacking, self._rows_of(lacking))
 
-    def _add(self, points: NDArray[np.integer], rows: dict[str, NDArray]) -> None:
+    def _add(self, points: NDArray[np.integer], rows: Columns) -> None:
         self._slot[points[:, 0], points[:, 1]] = np.arange(len(points)) + self._slots
         self._slots += len(points)
         for name, column in rows.items():
             self.columns[name] = np.concatenate([self.columns[name], column])
 
-    def _rows_of(self, points: NDArray[np.integer]) -> dict[str, NDArray]:
-        feet = self._lattice.feet(points)
-        parts = [self._empty]
-        for start in range(0, len(feet), _PLACES_PER_CALL):
-            parts.append(self._compute(feet[start : start + _PLACES_PER_CALL]))
+    def _rows_of(self, points: NDArray[np.integer]) -> Columns:
+        feet = self.lattice.feet(points)
+        calls = [feet[start : start + _PLACES_PER_CALL] for start in range(0, len(feet), _PLACES_PER_CALL)]
+        parts = [self._empty, *map(self._compute, calls)]
         return {name: np.concatenate([part[name] for part in parts]) for name in self._empty}

@@ -1,13 +1,16 @@
-"""A floor that fills with furniture, none of it in another's place, the door free, the rest walkable."""
+"""Fills a room with furniture, none of it in another's place, the door free, the rest walkable."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from avp_habitat.scenes.builtin.groups import Group, Member
-from avp_habitat.scenes.builtin.kit import FLAT_M, Lamp, Piece
+from avp_habitat.scenes.builtin import decor, groups, seating
+from avp_habitat.scenes.builtin.groups import Arrange, Group, Member
+from avp_habitat.scenes.builtin.kit import FLAT_M, Kit, Lamp, Piece, shifted
+from avp_habitat.scenes.builtin.noise import Random
 from avp_habitat.scenes.builtin.shapes import Float, Rectangle, Surface, moved
 from avp_habitat.scenes.builtin.shell import CURTAIN_M, Point, Shell, Wall, curtain_bottom
 
@@ -16,6 +19,15 @@ RADIUS_M = 0.15
 """The agent's radius and half a cell, so that the answer errs on the safe side."""
 _QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 """Cosine and sine of quarter turns."""
+_PICTURES = ((0.9, 0.65), (0.5, 0.7), (0.6, 0.85), (0.7, 0.5), (1.2, 0.8))
+"""Widths and heights of frames in metres."""
+_MIDDLE_M = 1.6
+"""Height at which the middle of a picture hangs."""
+_MAIN, _EXTRA, _SMALL = 0.45, 0.42, 0.41
+"""Share of the floor that stays walkable after placing main groups, storage, and what fills corners."""
+_Spots = Callable[[Wall], list[Point]]
+"""Where a group may stand at a wall: metres along it and in front of it."""
+_MOST_SPOTS = 120
 
 
 def free_cells(shell: Shell, blocks: list[Rectangle]) -> NDArray[np.bool_]:
@@ -201,3 +213,120 @@ def stand_at(member: Member, wall: Wall, right: float, inwards: float) -> Placed
     wide, deep = float(half[0]), float(half[2])
     footprint = (round(x - wide, 6), round(z - deep, 6), round(x + wide, 6), round(z + deep, 6))
     return Placed(member.piece, axes, (x, z), footprint)
+
+
+def _hang_one(floor: Floor, rng: Random, kit: Kit, wall: Wall, right: float, *, clock: bool) -> bool:
+    """Hang a picture or clock at a place on a wall if nothing is in its way."""
+    width, height = (0.34, 0.34) if clock else rng.choice(_PICTURES)
+    low, high = _MIDDLE_M - height / 2, _MIDDLE_M + height / 2
+    stand = stand_at(Member(Piece("", [], width, 0.06, high), 0.0, 0.03), wall, right, 0.0)
+    if not floor.is_free(stand, low, high, 0.1):
+        return False
+    surfaces = decor.clock(kit) if clock else decor.picture(kit, rng, width, height)
+    kind = "clock" if clock else "picture"
+    piece = Piece(kind, shifted(surfaces, 0.0, _MIDDLE_M, -0.03), width, 0.06, high)
+    floor.hang(replace(stand, piece=piece), low, high)
+    return True
+
+
+def _hang_pictures(floor: Floor, rng: Random, kit: Kit) -> None:
+    """Pictures on every wall that has room for them, one clock in some rooms."""
+    clock = rng.chance(0.6)
+    for wall in rng.shuffled(floor.shell.walls):
+        wanted = 3 if wall.length > 3 else 1
+        for right in rng.shuffled(places(0.5, wall.length - 0.4, 0.2)):
+            if wanted and _hang_one(floor, rng, kit, wall, right, clock=clock):
+                wanted, clock = wanted - 1, False
+
+
+def _hang_lamp(floor: Floor, rng: Random, kit: Kit) -> None:
+    """A pendant above the dining table, or where the room is open."""
+    ceiling, (x0, z0, x1, z1) = floor.shell.ceiling, floor.shell.bounds
+    tables = [stand.position for stand in floor.placed if stand.piece.kind == "dining table"]
+    bottom = min(2.1, round(ceiling - 0.62, 2))
+    piece = decor.pendant(kit, rng, ceiling, bottom)
+    half = piece.width / 2
+    for x, z in tables or [((x0 + x1) / 2 + 0.1, (z0 + z1) / 2), (x0 + 1.2, z0 + 1.2), (x1 - 1.2, z1 - 1.2)]:
+        stand = Placed(piece, np.eye(3), (x, z), (x - half, z - half, x + half, z + half))
+        if floor.is_free(stand, bottom - 0.05, ceiling, 0.03):
+            floor.hang(stand, bottom - 0.05, ceiling)
+            return
+
+
+def _put(floor: Floor, rng: Random, arrange: Arrange, spots: _Spots, least_share: float) -> bool:
+    """Place a group at the first spot, in random order, where it fits and leaves enough of the floor walkable."""
+    for wall in rng.shuffled([wall for wall in floor.shell.walls if spots(wall)]):
+        for right, inwards in rng.shuffled(spots(wall))[:_MOST_SPOTS]:
+            group = arrange(floor.shell.depth_at(wall, right) - inwards)
+            if group is not None and floor.try_group(group, wall, right, inwards, least_share=least_share):
+                return True
+    return False
+
+
+def _at_wall(wall: Wall) -> list[Point]:
+    return [(right, 0.0) for right in places(0.3, wall.length - 0.3, 0.2)]
+
+
+def _in_corners(wall: Wall) -> list[Point]:
+    return [(0.42, 0.0), (wall.length - 0.42, 0.0)]
+
+
+def _anywhere(wall: Wall) -> list[Point]:
+    return [(r, i) for r in places(0.6, wall.length - 0.5, 0.3) for i in places(0.1, 4.0, 0.3)]
+
+
+def _across(wall: Wall) -> list[Point]:
+    """Away from the ends of a long wall."""
+    shares = (0.3, 0.36, 0.43, 0.5, 0.57, 0.64, 0.7)
+    return [(round(wall.length * share, 2), 0.0) for share in shares] if wall.length >= 3.0 else []
+
+
+def _storage(kit: Kit, rng: Random) -> list[Arrange]:
+    """Tall and low furniture for walls, the second shelf and chest last."""
+    kinds = ((decor.bookshelf, 0.55), (decor.wardrobe, 0.6), (decor.drawers, 0.5))
+    first = [groups.against_wall(make(kit, rng), clear) for make, clear in kinds]
+    second = [groups.against_wall(make(kit, rng), clear) for make, clear in kinds[::2]]
+    return rng.shuffled(first) + second
+
+
+def _put_living(floor: Floor, rng: Random, kit: Kit) -> bool:
+    """Sofa, television and what belongs to them, as much as fits."""
+    return any(_put(floor, rng, arrange, _at_wall, _MAIN) for arrange in groups.living(kit, rng))
+
+
+def _put_main_groups(floor: Floor, rng: Random, kit: Kit) -> None:
+    """What the room is for, by its size, and what parts it."""
+    area = floor.shell.floor_area
+    sleeps = rng.chance(0.6 if area > 22 else 0.4)
+    sits = area > 20 or not sleeps
+    sits = sits and _put_living(floor, rng, kit)
+    sleeps = (sleeps or not sits) and _put(floor, rng, groups.sleeping(kit, rng), _at_wall, _MAIN)
+    if not sits and not sleeps:
+        sits = _put_living(floor, rng, kit)
+    if not (sits and sleeps) or area > 30:
+        _put(floor, rng, groups.dining(kit, rng), _anywhere, _MAIN)
+    any(_put(floor, rng, arrange, _across, _MAIN) for arrange in groups.divider(kit, rng, floor.shell.ceiling))
+
+
+def _put_the_rest(floor: Floor, rng: Random, kit: Kit) -> None:
+    """Desk, storage, a place to read, and what fills corners, as long as the floor stays walkable."""
+    first, *rest = _storage(kit, rng)
+    for arrange in (groups.working(kit, rng), first):
+        _put(floor, rng, arrange, _at_wall, _EXTRA)
+    any(_put(floor, rng, arrange, _at_wall, _EXTRA) for arrange in groups.reading(kit, rng))
+    for arrange in rest:
+        _put(floor, rng, arrange, _at_wall, _EXTRA)
+    for _ in range(2):
+        _put(floor, rng, groups.against_wall(decor.plant(kit, rng), 0.0), _in_corners, _SMALL)
+    if sum(stand.piece.kind == "side table" for stand in floor.placed) < 2:
+        _put(floor, rng, groups.against_wall(seating.side_table(kit, rng), 0.3), _at_wall, _SMALL)
+
+
+def furnish(shell: Shell, rng: Random, kit: Kit) -> list[Placed]:
+    """Furniture of a room, none of it in another's place, the door free, the floor walkable and in one part."""
+    floor = Floor(shell)
+    _put_main_groups(floor, rng, kit)
+    _put_the_rest(floor, rng, kit)
+    _hang_lamp(floor, rng, kit)
+    _hang_pictures(floor, rng, kit)
+    return floor.placed
