@@ -115,7 +115,8 @@ def run_batch(
         The episodes by scene (`scenes_of`), sorted by environment.
     """
     scenes = scenes_of(env)
-    wanted, seeds = np.zeros(env.num_envs, dtype=np.int64), [0] * env.num_envs
+    wanted = np.zeros(env.num_envs, dtype=np.int64)
+    seeds: list[int | None] = [None] * env.num_envs
     for agents in scenes.values():
         for place, agent in enumerate(agents):
             wanted[agent] = (episodes + len(agents) - 1 - place) // len(agents)
