@@ -9,6 +9,7 @@ from avp_experiment.configuration import ROOMS, TRAIN, UNSEEN
 from avp_experiment.results import Key, Results
 from avp_experiment.statistics import PREDICTORS, Summary
 from avp_experiment.tables import NOTHING
+from avp_habitat.metrics import FIGURES
 from avp_habitat.tables import table
 
 PAIRS = (("surface", "proposed"), (f"surface{ROOMS}", f"proposed{ROOMS}"))
@@ -16,6 +17,7 @@ PAIRS = (("surface", "proposed"), (f"surface{ROOMS}", f"proposed{ROOMS}"))
 FEWER_VIEWS, WORSE_DB, GOOD_RHO = 0.25, 0.3, 0.8
 """What the paper's method is held to: at least so many fewer views at no more than so much lower PSNR; and what a
 predictor of PSNR is held to."""
+VIEWS, COVERAGE, PSNR = (FIGURES[name] for name in ("views", "coverage", "psnr"))
 _WHERE = {TRAIN: "in the scenes of training", UNSEEN: "in unseen scenes"}
 Curves = dict[Key, dict[int, float]]
 """PSNR in dB by number of views, ascending, by episode."""
@@ -94,8 +96,8 @@ def _fewer_views(results: Results) -> list[str]:
             continue
         taken = " against ".join(map(_mean, views))
         lines.append(
-            f"{where} `proposed` takes {saved.text('coverage')} % fewer views than `coverage` ({taken}); its PSNR "
-            f"differs by {difference.text('psnr', sign=True)} dB. At least {100 * FEWER_VIEWS:.0f} % fewer views at a "
+            f"{where} `proposed` takes {saved.text(COVERAGE)} % fewer views than `coverage` ({taken}); its PSNR "
+            f"differs by {difference.text(PSNR, sign=True)} dB. At least {100 * FEWER_VIEWS:.0f} % fewer views at a "
             f"PSNR no more than {WORSE_DB} dB lower: {_holds(saved, difference)}"
         )
     return lines
@@ -163,7 +165,7 @@ def _curves(results: Results, method: str, role: str) -> Curves:
 
 
 def _equal_views(difference: Summary) -> str:
-    by = difference.text("psnr", sign=True)
+    by = difference.text(PSNR, sign=True)
     shown = f"at the smaller of their numbers of views its PSNR differs by {by} dB"
     higher = "higher" if difference.mean > 0 else "not higher"
     if np.isnan(difference.half_width):
@@ -244,14 +246,14 @@ def _over_scenes(values: Mapping[Key, float]) -> dict[Key, float]:
 
 def _heading(name: str) -> str:
     """Of a column of differences: those of percentages are in points."""
-    figure = statistics.figure_of(name)
+    figure = FIGURES[name]
     return f"{figure.title} [points]" if figure.unit == "%" else figure.heading
 
 
 def _difference(found: Summary | None, name: str) -> str:
-    return found.text(name, sign=True) if found else NOTHING
+    return found.text(FIGURES[name], sign=True) if found else NOTHING
 
 
 def _mean(views: Mapping[Key, float]) -> str:
     found = statistics.summary(views)
-    return found.text("views") if found else NOTHING
+    return found.text(VIEWS) if found else NOTHING

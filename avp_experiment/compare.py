@@ -42,8 +42,8 @@ class Compare:
     starts: str = AUTO
     """Episodes of each method, scene and seed; auto: the preset's number."""
     methods: Annotated[str, arg(help=_METHODS)] = AUTO
+    metrics: Annotated[str, arg(help=f"with commas between, or none: {METRICS_HELP}")] = NONE
     simulator: Annotated[str, arg(help=f"{', '.join(SIMULATORS)} or MODULE:FACTORY")] = "raycast"
-    metrics: Annotated[str, arg(help=f"with commas between: {METRICS_HELP}")] = ""
     up: Annotated[str | None, arg(help=UP_HELP)] = None
     out: str = AUTO
     """The experiment's folder, also of one to go on with; auto: runs/experiment-PRESET."""
@@ -64,10 +64,10 @@ class Compare:
         preset = replace(preset, seeds=_number("seeds", self.seeds, preset.seeds))
         preset = replace(preset, starts=_number("starts", self.starts, preset.starts))
         choice = SimulatorChoice(self.simulator, up=self.up)
-        scenes = read_scenes(_split(self.scene), [] if self.unseen == NONE else _split(self.unseen), choice)
-        metrics = tuple(_split(self.metrics))
+        metrics = _split(self.metrics)
         find_metrics(metrics)
-        return Configuration(self.preset, preset, scenes, methods, self.simulator, metrics, self.up)
+        scenes = read_scenes(_split(self.scene), _split(self.unseen), choice)
+        return Configuration(self.preset, preset, scenes, methods, tuple(metrics), self.simulator, self.up)
 
     @property
     def line(self) -> str:
@@ -82,7 +82,7 @@ class Compare:
 
 
 def _split(text: str) -> list[str]:
-    return [part.strip() for part in text.split(",") if part.strip()]
+    return [part.strip() for part in text.split(",") if part.strip() not in ("", NONE)]
 
 
 def _number(option: str, text: str, auto: int) -> int:
@@ -112,25 +112,25 @@ def compare(configuration: Configuration, out: Path, *, jobs: int, line: str) ->
     folder = open_folder(configuration, out)
     with folder.alone():
         folder.check_disk(plan(configuration, out, tracking="?"), configuration)
-        parent = open_parent(f"compare {configuration.preset_name}")
+        parent, experiment = open_parent(f"compare {configuration.preset_name}")
         status = "FAILED"
         try:
-            cells = plan(configuration, out, tracking=parent.experiment)
+            cells = plan(configuration, out, tracking=experiment)
             preload = () if SimulatorChoice(configuration.simulator).one_per_process else PRELOAD
             runner = Runner(folder, jobs, environment(tracking_uri()), preload)
             runner.run(cells)
             results = gather(configuration, folder, cells, command=line)
             write_report(out)
-            log_results(parent, results, out)
+            log_results(parent, experiment, results, out)
             status = "FINISHED"
         except KeyboardInterrupt:
             status = "KILLED"
             print(f"\nwhat is done is kept in {out}; to go on:  {line}", file=sys.stderr)
             raise
         finally:
-            parent.run.close(status)
+            parent.close(status)
     print(f"results:      {out}/results.md (tables, figures, claims; from {out}/results.json)")
-    print(f"MLflow run:   {parent.run.run_id}")
+    print(f"MLflow run:   {parent.run_id}")
     if runner.failed:
         raise AVPError(
             f"{len(runner.failed)} of {len(cells)} cells failed (reasons: {out}/results.md); "

@@ -2,7 +2,6 @@
 
 import fcntl
 import json
-import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ from typing import Any
 from avp_experiment.cells import COLLECT, RECONSTRUCT, TRAIN, Cell
 from avp_experiment.configuration import Configuration
 from avp_habitat.errors import AVPError, UsageError
-from avp_habitat.rollout.capture import VIEWS
+from avp_habitat.files import atomic_file
 
 FORMAT = 1
 CONFIGURATION = "experiment.json"
@@ -65,11 +64,11 @@ class Folder:
 
     def finish(self, cell: Cell, about: dict[str, Any]) -> None:
         """Remember that a cell is done; the last thing that happens to it."""
-        write_whole(cell.folder(self.root) / DONE, {"command": cell.command, **about}, indent=1)
+        write_json(cell.folder(self.root) / DONE, {"command": cell.command, **about}, indent=1)
 
     def fail(self, cell: Cell, reason: str) -> None:
         """Remember why a cell failed."""
-        write_whole(cell.folder(self.root) / FAILED, {"command": cell.command, "reason": reason}, indent=1)
+        write_json(cell.folder(self.root) / FAILED, {"command": cell.command, "reason": reason}, indent=1)
 
     @contextmanager
     def alone(self) -> Iterator[None]:
@@ -131,20 +130,16 @@ def open_folder(configuration: Configuration, root: Path) -> Folder:
     try:
         root.mkdir(parents=True, exist_ok=True)
         fixed = {name: value for name, value in wanted.items() if name != "starts"}
-        write_whole(path, {"format": FORMAT, **fixed}, indent=1)
+        write_json(path, {"format": FORMAT, **fixed}, indent=1)
     except OSError as error:
         raise AVPError(f"out: {root}: cannot write there: {error.strerror}") from None
     return Folder(root)
 
 
-def write_whole(path: Path, content: dict[str, Any], **style: Any) -> None:
+def write_json(path: Path, content: dict[str, Any], **style: Any) -> None:
     """Write a JSON file, whole or not at all."""
-    temporary = path.with_suffix(".part")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(json.dumps(content, allow_nan=False, **style) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    with atomic_file(path) as partial:
+        partial.write_text(json.dumps(content, allow_nan=False, **style) + "\n", encoding="utf-8")
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -166,6 +161,8 @@ def _known(path: Path) -> dict[str, Any]:
 
 def _bytes_needed(cells: Sequence[Cell], configuration: Configuration) -> int:
     """About how much disk cells take; measured: a picture with its depth takes up to 3.5 bytes per pixel."""
+    from avp_habitat.rollout.capture import VIEWS
+
     width, height = configuration.preset.size
     rollout = 7 * width * height * (configuration.preset.budget + VIEWS) // 2
     size = {TRAIN: 8 * _MB, COLLECT: rollout, RECONSTRUCT: _MB}

@@ -12,7 +12,7 @@ from PIL import Image
 from avp_experiment.configuration import ROOMS, TRAIN, UNSEEN
 from avp_experiment.results import Key, Results, Training
 from avp_experiment.statistics import PREDICTORS, Point, correlations, points_of, summary
-from avp_habitat.metrics import figure_of
+from avp_habitat.metrics import FIGURES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -144,7 +144,7 @@ def visibility_and_psnr(results: Results) -> Drawn:
     for axes, name in zip(panels, PREDICTORS, strict=True):
         for method in results.methods:
             _scatter(axes, [point for point in points if point.method == method], name)
-        axes.set_xlabel(figure_of(name).heading)
+        axes.set_xlabel(FIGURES[name].heading)
         axes.grid(alpha=0.3)
         axes.set_title(_correlation_title(points, name), fontsize=10)
     panels[0].set_ylabel("PSNR on held-out views [dB]")
@@ -222,9 +222,9 @@ def _scatter(axes: "Axes", points: Sequence[Point], name: str) -> None:
         if not chosen:
             continue
         colour, marker, line = style_of(chosen[0].method)
-        look = {"marker": marker, "edgecolors": colour, "facecolors": colour if line == "-" else "none"}
+        look: dict[str, Any] = {"marker": marker, "edgecolors": colour, "facecolors": colour if line == "-" else "none"}
         look |= {"s": 46, "alpha": 0.9} if whole else {"s": 16, "alpha": 0.4}
-        shares = [figure_of(name).scale * point.shares[name] for point in chosen]
+        shares = [FIGURES[name].scale * point.shares[name] for point in chosen]
         label = chosen[0].method if whole or len(chosen) == len(points) else None
         axes.scatter(shares, [point.psnr for point in chosen], label=label, linewidths=1.1, **look)
 

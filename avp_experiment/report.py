@@ -93,13 +93,13 @@ def _table(results: Results, name: str, role: str, title: str) -> str:
         for path in paths:
             path.unlink(missing_ok=True)
         raise Missing("no episode there is done" if results.scenes(role) else "no such scene in this experiment")
-    for path, text in zip(paths, (f"# {title}\n\n{table.markdown()}", table.csv()), strict=True):
+    markdown, numbers, counts = table
+    for path, text in zip(paths, (f"# {title}\n\n{markdown}", numbers), strict=True):
         path.write_text(text, encoding="utf-8")
-    counts = sorted(table.episodes.values())
-    episodes = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
+    episodes = " to ".join(str(count) for count in dict.fromkeys((min(counts), max(counts))))
     return (
         f"{', '.join(results.scenes(role))}: mean ± 95 % confidence interval over {results.seeds} (Student's t), "
-        f"{episodes} episodes of each method. [CSV]({name}.csv)\n\n{table.markdown().rstrip()}"
+        f"{episodes} episodes of each method. [CSV]({name}.csv)\n\n{markdown.rstrip()}"
     )
 
 

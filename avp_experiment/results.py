@@ -7,7 +7,7 @@ import platform
 import shutil
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from avp_experiment.cells import COLLECT, RECONSTRUCT, Cell, floor_map
 from avp_experiment.cells import TRAIN as TRAINING
 from avp_experiment.configuration import TRAIN, UNSEEN, Configuration, scene_slug
-from avp_experiment.folder import Folder, write_whole
+from avp_experiment.folder import Folder, write_json
 from avp_habitat.errors import AVPError, UsageError
+from avp_habitat.metrics import FIGURES, Figure, figures
 from avp_habitat.provenance import PACKAGES, installed_versions
 
 FORMAT = 1
@@ -89,6 +90,8 @@ class Results:
     configuration: Mapping[str, Any]
     methods: tuple[str, ...]
     """In the order of the tables."""
+    figures: Mapping[str, Figure]
+    """Those that users added, by name."""
     origin: Mapping[str, Any]
     """Command, commits, machine, versions."""
     training: tuple[Training, ...]
@@ -158,6 +161,8 @@ def read_results(folder: Path) -> Results:
     if not isinstance(value, dict) or value.get("format") != FORMAT:
         found = value.get("format") if isinstance(value, dict) else type(value).__name__
         raise AVPError(f"{path}: expected results of format {FORMAT}, found {found!r}")
+    # Results of before users could add figures.
+    value.setdefault("figures", {})
     found = {name: _part(path, value, name, made_of) for name, made_of in _PARTS.items()}
     return Results(folder, **found)
 
@@ -212,6 +217,7 @@ def _reconstruction(entry: Any) -> Reconstruction:
 _PARTS: dict[str, Callable[[Any], Any]] = {
     "configuration": _configuration,
     "methods": tuple,
+    "figures": lambda entries: {name: Figure(**entry) for name, entry in entries.items()},
     "origin": dict,
     "training": lambda entries: tuple(map(_training, entries)),
     "rollouts": lambda entries: tuple(map(_episode, entries)),
@@ -234,10 +240,13 @@ def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], 
         The content.
     """
     done = [(cell, record) for cell in cells if (record := folder.record(cell)) is not None]
+    known = figures(configuration.metrics)
+    measured = {name for cell, record in done if cell.kind == COLLECT for name in record["facts"]["metrics"]}
     results = {
         "format": FORMAT,
         "configuration": configuration.as_json(),
         "methods": [method.name for method in configuration.methods],
+        "figures": {name: asdict(known[name]) for name in sorted(measured & set(known) - set(FIGURES))},
         "origin": {
             "command": command,
             "commits": sorted({record["commit"] for _, record in done if record["commit"]}),
@@ -255,7 +264,7 @@ def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], 
     }
     for cell, _ in done:
         _copy_pictures(cell, folder.root)
-    write_whole(folder.root / FILE, results, separators=(",", ":"))
+    write_json(folder.root / FILE, results, separators=(",", ":"))
     return results
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from avp_experiment.results import Key, Results
-from avp_habitat.metrics import CONFIDENCE, figure_of, mean_and_half_width
+from avp_habitat.metrics import CONFIDENCE, Figure, mean_and_half_width
 
 RESAMPLES = 2000
 _BOOTSTRAP_SEED = 0
@@ -29,9 +29,8 @@ class Summary:
         """Its ends; nan for one seed."""
         return self.mean - self.half_width, self.mean + self.half_width
 
-    def text(self, name: str, *, sign: bool = False) -> str:
-        """Mean ± half the interval, without ± for one seed, as the figure of this name is shown; no unit."""
-        figure = figure_of(name)
+    def text(self, figure: Figure, *, sign: bool = False) -> str:
+        """Mean ± half the interval, without ± for one seed, as a figure is shown; no unit."""
         shown = figure.text(self.mean, self.half_width)
         return f"+{shown}" if sign and not shown.startswith("-") else shown
 
@@ -97,12 +96,7 @@ def at_views(curve: Mapping[int, float], views: float) -> float | None:
 
 
 def views_to_reach(curve: Mapping[int, float], target: float) -> float | None:
-    """The least number of views at which a figure reaches a target, linear between measured ones; None for never.
-
-    Args:
-        curve: by number of views, ascending. A target that the first one has reached is answered with that one.
-        target: of the figure.
-    """
+    """The least number of views, of those measured or between, at which a figure reaches a target; None for never."""
     measured, values = list(curve), list(curve.values())
     reached = next((place for place, value in enumerate(values) if value >= target), None)
     if not reached:
@@ -120,22 +114,15 @@ def spearman(x: ArrayLike, y: ArrayLike, rollout: Sequence[object]) -> Correlati
     x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
         return None
-    names = {name: number for number, name in enumerate(dict.fromkeys(rollout))}
-    member = np.array([names[name] for name in rollout])
-    low, high = _bootstrap(x, y, member, len(names)) if len(names) > 1 else (np.nan, np.nan)
-    return Correlation(float(_rho(x, y, np.ones((1, len(x))))[0]), low, high, len(x), len(names))
-
-
-def _bootstrap(x: NDArray, y: NDArray, member: NDArray, rollouts: int) -> tuple[float, float]:
-    """Percentile interval over draws of whole rollouts; a rollout drawn k times counts k times."""
-    rng = np.random.default_rng(_BOOTSTRAP_SEED)
-    times = rng.multinomial(rollouts, np.full(rollouts, 1 / rollouts), size=RESAMPLES)
-    found = _rho(x, y, times[:, member].astype(np.float64))
-    found = found[np.isfinite(found)]
-    if not len(found):
-        return np.nan, np.nan
-    low, high = np.quantile(found, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return float(low), float(high)
+    names = list(dict.fromkeys(rollout))
+    low = high = np.nan
+    if len(names) > 1:
+        # A rollout that is drawn k times counts k times.
+        rng = np.random.default_rng(_BOOTSTRAP_SEED)
+        times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), size=RESAMPLES).astype(np.float64)
+        drawn = _rho(x, y, times[:, [names.index(name) for name in rollout]])
+        low, high = np.nanquantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Correlation(float(_rho(x, y, np.ones((1, len(x))))[0]), float(low), float(high), len(x), len(names))
 
 
 def _rho(x: NDArray, y: NDArray, times: NDArray) -> NDArray:

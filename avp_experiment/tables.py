@@ -2,15 +2,14 @@
 
 import csv
 import io
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from avp_experiment.configuration import ROOMS, TRAIN
 from avp_experiment.results import Key, Results
 from avp_experiment.statistics import Summary, summary
-from avp_habitat.metrics import FIGURES, Figure, figure_of
+from avp_habitat.metrics import FIGURES, Figure
 from avp_habitat.tables import table
 
 SCORES = ("psnr", "ssim", "lpips")
@@ -19,69 +18,48 @@ COLUMNS = ("views", "coverage", "annd_m", "ei", "path_length_m", "visibility", *
 NOTHING = "–"
 
 
-@dataclass(frozen=True)
-class Table:
-    """One of the tables."""
-
-    columns: tuple[Figure, ...]
-    """Those for which there are values."""
-    rows: dict[str, dict[str, Summary | None]]
-    """By method and column."""
-    episodes: dict[str, int]
-    """By method."""
-    notes: tuple[str, ...]
-    """What is not in it, and why."""
-
-    def markdown(self) -> str:
-        """With mean ± half the 95 % confidence interval over seeds, and the notes below."""
-        head = ["method", *(column.heading for column in self.columns)]
-        rows = [
-            [method, *(found.text(name) if found else NOTHING for name, found in cells.items())]
-            for method, cells in self.rows.items()
-        ]
-        return "\n".join([table(head, rows, words=1), *(f"\n{note}" for note in self.notes)]) + "\n"
-
-    def csv(self) -> str:
-        """The same in the same units, mean and half width in columns of their own, with more digits."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        titles = [title for column in self.columns for title in (column.heading, f"± {column.heading}")]
-        writer.writerow(["method", "seeds", "episodes", *titles])
-        for method, found in self.rows.items():
-            seeds = max((cell.seeds for cell in found.values() if cell), default=0)
-            numbers = [number for column in self.columns for number in _numbers(found[column.name], column)]
-            writer.writerow([method, seeds, self.episodes[method], *numbers])
-        return text.getvalue()
+Rows = dict[str, dict[str, Summary | None]]
 
 
-def make_table(results: Results, role: str) -> Table | None:
-    """The table of the scenes of a role; None where no method has an episode there."""
-    known = dict.fromkeys(name for one in results.rollouts for name in one.metrics)
-    # `return_NAME` is a part of the reward, not a figure.
-    names = (*COLUMNS, *(name for name in known if name not in FIGURES and not name.startswith("return_")))
-    found = {method: {name: results.values(method, role, name) for name in names} for method in results.methods}
+def make_table(results: Results, role: str) -> tuple[str, str, list[int]] | None:
+    """The table of the scenes of a role; None where no method has an episode there.
+
+    Returns:
+        Markdown with mean ± half the 95 % interval over seeds and notes below, CSV, and the numbers of episodes.
+    """
+    figures = {name: FIGURES[name] for name in COLUMNS} | dict(results.figures)
+    found = {method: {name: results.values(method, role, name) for name in figures} for method in results.methods}
     found = {method: values for method, values in found.items() if values["coverage"]}
     if not found:
         return None
-    shown = [name for name in names if any(values[name] for values in found.values())]
-    rows = {method: {name: summary(values[name]) for name in shown} for method, values in found.items()}
-    missing = [f"No {figure_of(name).heading}: {_why_missing(results, name)}." for name in names if name not in shown]
-    return Table(
-        columns=tuple(figure_of(name) for name in shown),
-        rows=rows,
-        episodes={method: len(values["coverage"]) for method, values in found.items()},
-        notes=(
-            *(f"No {figure_of(name).heading}: {_why_missing(results, name)}." for name in missing),
-            *_notes(results, role, found),
-        ),
-    )
+    shown = [figure for name, figure in figures.items() if any(values[name] for values in found.values())]
+    rows = {method: {one.name: summary(values[one.name]) for one in shown} for method, values in found.items()}
+    missing = [figure for figure in figures.values() if figure not in shown]
+    notes = [f"No {figure.heading}: {_why_missing(results, figure.name)}." for figure in missing]
+    cells = [
+        [method, *(mean.text(one) if (mean := row[one.name]) else NOTHING for one in shown)]
+        for method, row in rows.items()
+    ]
+    markdown = table(["method", *(figure.heading for figure in shown)], cells, words=1)
+    episodes = {method: len(values["coverage"]) for method, values in found.items()}
+    text = "\n".join([markdown, *(f"\n{note}" for note in (*notes, *_notes(results, role, found)))])
+    return f"{text}\n", _csv(rows, shown, episodes), list(episodes.values())
 
 
-def _numbers(found: Summary | None, figure: Figure) -> list[str]:
-    if found is None:
-        return ["", ""]
-    half = "" if np.isnan(found.half_width) else f"{figure.scale * found.half_width:.6g}"
-    return [f"{figure.scale * found.mean:.6g}", half]
+def _csv(rows: Rows, shown: Sequence[Figure], episodes: Mapping[str, int]) -> str:
+    """The same in the same units, mean and half width in columns of their own, with more digits."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    titles = [title for figure in shown for title in (figure.heading, f"± {figure.heading}")]
+    writer.writerow(["method", "seeds", "episodes", *titles])
+    for method, row in rows.items():
+        line = [method, max((mean.seeds for mean in row.values() if mean), default=0), episodes[method]]
+        for figure in shown:
+            mean = row[figure.name]
+            both = (mean.mean, mean.half_width) if mean else (np.nan, np.nan)
+            line += ["" if np.isnan(number) else f"{figure.scale * number:.6g}" for number in both]
+        writer.writerow(line)
+    return text.getvalue()
 
 
 def _notes(results: Results, role: str, found: Mapping[str, Mapping[str, Mapping[Key, float]]]) -> list[str]:

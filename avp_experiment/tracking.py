@@ -3,7 +3,6 @@
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +16,8 @@ EXPERIMENT = "avp-experiment"
 """MLflow experiment outside of `mlflow run` where `MLFLOW_EXPERIMENT_NAME` names none."""
 KIND = "experiment"
 _ARTIFACTS = ("*.md", "*.csv", "*.png", "results.json", "experiment.json")
-_NOT_LOGGED = ("return_", "visibility_", "redundant_", "surface")
-"""How figures of an episode begin that only `results.json` keeps."""
+_SHOWN = ("views", "coverage", "annd_m", "ei", "path_length_m", "visibility", "collisions", "stopped")
 Figures = dict[str, float]
-
-
-@dataclass(frozen=True)
-class Parent:
-    """The parent run."""
-
-    run: TrackedRun
-    """Where the tables go; one of `mlflow run` gets its end from there."""
-    experiment: str
-    """Name of its MLflow experiment, in which the trainings are made too."""
 
 
 def tracking_uri() -> str:
@@ -37,8 +25,8 @@ def tracking_uri() -> str:
     return absolute(os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_ADDRESS)
 
 
-def open_parent(name: str) -> Parent:
-    """The run that `mlflow run` has begun, else a new one.
+def open_parent(name: str) -> tuple[TrackedRun, str]:
+    """The run that `mlflow run` has begun, else a new one; and the MLflow experiment, in which trainings are made too.
 
     Raises:
         TrackingError: the store cannot be used.
@@ -48,15 +36,13 @@ def open_parent(name: str) -> Parent:
         client = connect(address)
         identity = existing_run(client, begun).info.experiment_id
         client.set_tag(begun, KIND_TAG, KIND)
-        return Parent(join_run(address, begun), client.get_experiment(identity).name)
+        return join_run(address, begun), client.get_experiment(identity).name
     experiment = os.environ.get(NAME_VARIABLE) or EXPERIMENT
-    run = start_run(address, NewRun(experiment=experiment, name=name, tags={KIND_TAG: KIND}))
-    return Parent(run, experiment)
+    return start_run(address, NewRun(experiment=experiment, name=name, tags={KIND_TAG: KIND})), experiment
 
 
-def log_results(parent: Parent, results: Mapping[str, Any], folder: Path) -> None:
+def log_results(run: TrackedRun, experiment: str, results: Mapping[str, Any], folder: Path) -> None:
     """Tables, figures and means into the parent, its trainings below it, and a run for each method, scene and seed."""
-    run = parent.run
     settings = {name: value for name, value in results["configuration"].items() if name != "scenes"}
     scenes = {f"scene.{scene['role']}.{i}": scene["name"] for i, scene in enumerate(results["configuration"]["scenes"])}
     run.params(flat({"experiment": settings}) | scenes)
@@ -69,7 +55,7 @@ def log_results(parent: Parent, results: Mapping[str, Any], folder: Path) -> Non
         tags = {POLICY_TAG: method, SCENE_TAG: scene, METHOD_TAG: "experiment", "avp.role": role}
         tags |= {KIND_TAG: "experiment-cell"}
         name = f"{method} on {scene} (seed {seed})"
-        child = start_run(run.address, NewRun(experiment=parent.experiment, name=name, tags=tags, parent=run.run_id))
+        child = start_run(run.address, NewRun(experiment=experiment, name=name, tags=tags, parent=run.run_id))
         child.params({"method": method, "scene": scene, "role": role, "seed": seed})
         child.metrics({f"eval/{name}": value for name, value in figures.items()}, 0)
         child.close("FINISHED")
@@ -86,8 +72,9 @@ def _by_seed(results: Mapping[str, Any]) -> dict[tuple[str, str, str, int], Figu
     found: dict[tuple[str, str, str, int], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for part in (*results["rollouts"], *(one for one in results["reconstructions"] if one["whole"])):
         figures = found[part["method"], part["role"], part["scene"], part["seed"]]
-        for name, value in (part.get("scores") or part["metrics"]).items():
-            if value is not None and not name.startswith(_NOT_LOGGED):
+        names = part.get("scores") or (*_SHOWN, *results["figures"])
+        for name in names:
+            if (value := part.get("scores", part.get("metrics", {})).get(name)) is not None:
                 figures[name].append(value)
     return {key: {name: sum(values) / len(values) for name, values in one.items()} for key, one in found.items()}
 

@@ -17,7 +17,7 @@ from avp_habitat.gpu import nerfacto_line
 from avp_habitat.metrics import METRICS_HELP
 from avp_habitat.plugins import name_of
 from avp_habitat.policies.registry import (
-    POLICY_NAMES,
+    POLICIES_HELP,
     TRUSTED,
     check_policy,
     described,
@@ -30,8 +30,8 @@ from avp_habitat.rollout.capture import VIEWS, capture_heldout, capture_step, pu
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
-from avp_habitat.task.rewards import REWARD_NAMES
-from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
+from avp_habitat.task.rewards import REWARDS_HELP
+from avp_habitat.task.settings import OBSERVATIONS_HELP, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
 from avp_habitat.tracking.rollout_run import command_for, rollout_run
 from avp_habitat.tracking.stores import TrackingError, about_run, address_of, open_store, shown
@@ -45,13 +45,13 @@ class Collect:
     """
 
     scene: Annotated[str, arg(help=SCENES)]
-    policy: Annotated[str, arg(help=f"{', '.join(POLICY_NAMES)}, MODULE:OBJECT, or a model (.zip)")]
+    policy: Annotated[str, arg(help=POLICIES_HELP)]
     out: Path
     """The rollout folder to write; must not exist."""
-    reward: Annotated[str, arg(help=f"{', '.join(REWARD_NAMES)} or MODULE:FUNCTION")] = "proposed"
+    reward: Annotated[str, arg(help=REWARDS_HELP)] = "proposed"
     observation: Annotated[
         str | None,
-        arg(help=f"{', '.join(OBSERVATION_NAMES)} or MODULE:OBJECT (omitted: the first that fits the policy)"),
+        arg(help=f"{OBSERVATIONS_HELP} (omitted: the first that fits the policy)"),
     ] = None
     simulator: SimulatorChoice = field(default_factory=SimulatorChoice)
     """Which simulator opens the scene."""

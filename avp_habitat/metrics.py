@@ -133,10 +133,6 @@ def metric(figure: Figure, *, of: Of = "episode") -> Callable[[MetricFunction], 
     return plugins.declares(figure=figure, of=of)
 
 
-_found: dict[str, Figure] = {}
-"""Of the metrics that this process has found, for the tables that show them."""
-
-
 def find_metrics(chosen: Sequence[str | MetricFunction]) -> list[Any]:
     """The functions behind the names of metrics: `module:function`, or what another distribution registers.
 
@@ -155,7 +151,6 @@ def find_metrics(chosen: Sequence[str | MetricFunction]) -> list[Any]:
         if figure.name in taken:
             raise UsageError(f"metric {said!r}: there is a figure named {figure.name!r} already; choose another name")
         taken.add(figure.name)
-        _found[figure.name] = figure
     return found
 
 
@@ -175,19 +170,23 @@ def measured(chosen: Iterable[str | MetricFunction], of: Of, thing: Any) -> dict
     return values
 
 
-def figures() -> dict[str, Figure]:
-    """All figures by name: the suite's, those of metrics found in this process, and those that distributions register.
+def figures(chosen: Sequence[str | MetricFunction] = ()) -> dict[str, Figure]:
+    """All figures by name: the suite's, those that other distributions register, and those of the chosen metrics.
 
     A registered metric that cannot be imported is left out: what it measured is then shown by its key.
+
+    Args:
+        chosen: metrics, for those that are named by `module:function` or given as they are.
     """
+    found = []
     for name in plugins.names("avp.metrics", ()):
         with suppress(UsageError):
-            find_metrics((name,))
-    return FIGURES | _found
+            found += find_metrics((name,))
+    return FIGURES | {function.figure.name: function.figure for function in [*found, *find_metrics(tuple(chosen))]}
 
 
 def figure_of(name: str) -> Figure:
-    """How a figure is called and shown; one that nobody here knows, by its key."""
+    """How a figure is called and shown; one that nobody registers, by its key."""
     return figures().get(name) or Figure(name, name.replace("_", " "), digits=3)
 
 

@@ -1,4 +1,4 @@
-"""Axes, camera poses and pinhole projection: the only module that flips a sign.
+"""Axes, camera poses and pinhole projection: the only module that flips a sign, but for `sight.rules.in_camera`.
 
 World: right-handed, metres, Y up, the floor is the X-Z plane (Habitat's). Yaw is about +Y, 0 looks along -Z, left is
 positive; pitch is positive upwards; both in radians. A pose is `camera_to_world`, 4x4. Camera axes are *habitat*

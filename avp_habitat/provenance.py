@@ -6,6 +6,19 @@ from collections.abc import Iterable, Mapping
 from importlib import metadata
 from typing import Any
 
+PACKAGES = (
+    "avp-suite",
+    "stable-baselines3",
+    "nerfstudio",
+    "torch",
+    "gymnasium",
+    "numpy",
+    "open3d",
+    "mlflow",
+    "rerun-sdk",
+)
+"""The suite, and what its results depend on most."""
+
 
 def git_commit() -> str | None:
     """The commit checked out in the current folder; None outside a repository or without git."""
@@ -28,20 +41,6 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             leaves[f"{prefix}{key}"] = value
     return leaves
-
-
-PACKAGES = (
-    "avp-suite",
-    "stable-baselines3",
-    "nerfstudio",
-    "torch",
-    "gymnasium",
-    "numpy",
-    "open3d",
-    "mlflow",
-    "rerun-sdk",
-)
-"""The suite, and what its results depend on most."""
 
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:

@@ -14,6 +14,7 @@ from tyro.conf import Positional
 
 from avp_habitat import command
 from avp_habitat.errors import RolloutError, UsageError
+from avp_habitat.files import atomic_file
 from avp_habitat.poses import camera_to_world, y_up_to_z_up, yaw_and_pitch
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.format import read_rollout
@@ -141,14 +142,8 @@ def _smooth(track: Float) -> Float:
 
 def main(film: CameraPath) -> None:
     """Write one camera path; print what to run next."""
-    if film.out.exists():
-        raise UsageError(f"--out: {film.out} exists; name another file, or remove it first")
-    content = json.dumps(camera_path(film))
-    try:
-        film.out.parent.mkdir(parents=True, exist_ok=True)
-        film.out.write_text(content, encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"--out: expected a place to write {film.out}, got: {error.strerror}") from None
+    with atomic_file(film.out, replace=False, failure=UsageError, option="--out") as file:
+        file.write_text(json.dumps(camera_path(film)), encoding="utf-8")
     path, video = (shlex.quote(str(name)) for name in (film.out, film.out.with_suffix(".mp4")))
     print(f"{film.out}: {film.frames} cameras, {film.seconds:g} s at {film.fps} pictures per second")
     print(f"render:  ns-render camera-path --load-config CONFIG --camera-path-filename {path} --output-path {video}")

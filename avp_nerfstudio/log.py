@@ -13,6 +13,7 @@ from tyro.conf import Positional, arg
 
 from avp_habitat import command
 from avp_habitat.errors import RolloutError, UsageError
+from avp_habitat.files import check_new
 from avp_habitat.metrics import TERMS, explained
 from avp_habitat.ranges import Range, number
 from avp_habitat.tracking.experiments import DEFAULT_HELP
@@ -56,8 +57,8 @@ class Log:
         """Refuse what cannot be right."""
         if self.pictures is not None:
             number("pictures", self.pictures, int, Range(0, 10**9))
-        if self.rerun is not None and self.rerun.exists():
-            raise UsageError(f"rerun: {self.rerun} exists already; choose another name or remove it")
+        if self.rerun is not None:
+            check_new(self.rerun, option="--rerun")
 
 
 def main(options: Log) -> None:

@@ -14,15 +14,15 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from avp_habitat import command
-from avp_habitat.errors import RolloutError, UsageError
-from avp_habitat.files import NewFolder
+from avp_habitat.errors import AVPError, RolloutError, UsageError
+from avp_habitat.files import atomic_folder
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.format import Rollout, read_rollout
 from avp_habitat.tracking.stores import address_of, open_store
 
 
 @dataclass(frozen=True)
-class Reconstruction:
+class Reconstruct:
     """Train on the captured frames of a rollout and score its held-out views.
 
     The scores are written to a folder that exists only when all is done.
@@ -55,7 +55,7 @@ class Reconstruction:
             raise UsageError(f"iterations: expected a number from 1, got {self.iterations}")
 
 
-def reconstruct(options: Reconstruction) -> dict[str, Any]:
+def reconstruct(options: Reconstruct) -> dict[str, Any]:
     """Train on a rollout, score all held-out views, write the folder.
 
     Returns:
@@ -67,7 +67,7 @@ def reconstruct(options: Reconstruction) -> dict[str, Any]:
         AVPError: the folder cannot be written, or MLflow cannot be reached; nothing is left behind.
     """
     started = time.monotonic()
-    with NewFolder(options.out) as folder:
+    with atomic_folder(options.out, failure=AVPError, option="--out") as folder:
         rollout = read_rollout(options.rollout)
         _check_rollout(options, rollout)
         address = address_of(options.mlflow, default=None)
@@ -78,12 +78,10 @@ def reconstruct(options: Reconstruction) -> dict[str, Any]:
             warnings.simplefilter("ignore")
             from avp_nerfstudio.method.reconstruction import process
 
-            found = process(options, rollout, folder, started=started, address=address)
-        folder.publish()
-    return found
+            return process(options, rollout, folder, started=started, address=address)
 
 
-def _check_rollout(options: Reconstruction, rollout: Rollout) -> None:
+def _check_rollout(options: Reconstruct, rollout: Rollout) -> None:
     for kind, views in (("captured frame", rollout.frames), ("held-out view", rollout.heldout)):
         if not views:
             raise RolloutError(f"{rollout.folder}: expected at least one {kind}, found none")
@@ -98,7 +96,7 @@ def _check_rollout(options: Reconstruction, rollout: Rollout) -> None:
         )
 
 
-def main(options: Reconstruction) -> None:
+def main(options: Reconstruct) -> None:
     """Reconstruct one rollout; print its scores."""
     found = reconstruct(options)
     words = ", ".join(f"{name} {value:.4g}" for name, value in found["scores"].items() if value is not None)

@@ -3,7 +3,7 @@
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,13 +15,13 @@ from avp_habitat.command import progress
 from avp_habitat.errors import UsageError
 from avp_habitat.files import check_new, check_writable
 from avp_habitat.metrics import METRICS_HELP
-from avp_habitat.policies.registry import POLICY_NAMES, TRUSTED, check_policy, described
+from avp_habitat.policies.registry import POLICIES_HELP, TRUSTED, check_policy, described
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.drawing import draw_trajectory
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
-from avp_habitat.task.rewards import REWARD_NAMES
-from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
+from avp_habitat.task.rewards import REWARDS_HELP
+from avp_habitat.task.settings import OBSERVATIONS_HELP, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
 from avp_sb3.evaluation.policy import Episode, PolicyRunner
 from avp_sb3.evaluation.report import LEGEND, ReportError, table, write_report
@@ -37,14 +37,14 @@ class Evaluate:
     scene: Annotated[str, arg(help=SCENES)]
     policy: Annotated[
         UseAppendAction[tuple[str, ...]],
-        arg(help=f"{', '.join(POLICY_NAMES)}, or a model (.zip); give it again for each policy to compare"),
+        arg(help=f"{POLICIES_HELP}; give it again for each policy to compare"),
     ]
     episodes: Annotated[int, Range(1, 1e6)] = 20
     """Per policy."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 1000
     """Of the first start; episode i uses SEED + i."""
-    reward: Annotated[str, arg(help=", ".join(REWARD_NAMES))] = "proposed"
-    observation: Annotated[str | None, arg(help=f"{', '.join(OBSERVATION_NAMES)} (omitted: the model's own)")] = None
+    reward: Annotated[str, arg(help=REWARDS_HELP)] = "proposed"
+    observation: Annotated[str | None, arg(help=f"{OBSERVATIONS_HELP} (omitted: the model's own)")] = None
     simulator: SimulatorChoice = field(default_factory=SimulatorChoice)
     """Which simulator opens the scene."""
     metrics: Annotated[tuple[str, ...], arg(help=METRICS_HELP)] = ()
@@ -122,8 +122,8 @@ def _report(
         return
     env = runners[0].env
     about = _about(env, options, complete=complete)
-    print(f"{table(results)}\n\n{LEGEND}\n")
-    write_report(out, results, about)
+    print(f"{table(results, options.metrics)}\n\n{LEGEND}\n")
+    write_report(out, results, about, options.metrics)
     if not complete:
         print(f"interrupted after {sum(map(len, done.values()))} episodes, which are kept")
     print(f"report:  {out}")
@@ -134,12 +134,14 @@ def _report(
 
     firsts = {name: episodes[0].trajectory for name, episodes in done.items() if episodes}
     pictures = {name: draw_trajectory(env.area, first) for name, first in firsts.items() if first is not None}
-    run, experiment, store = track_evaluation(results, about, out, experiment=options.experiment, pictures=pictures)
+    run, experiment, store = track_evaluation(
+        results, about, out, experiment=options.experiment, pictures=pictures, metrics=options.metrics
+    )
     print(f"MLflow:  run {run} in experiment {experiment!r} at {store}")
 
 
 def _about(env: Any, options: Evaluate, *, complete: bool) -> dict[str, Any]:
-    settings = asdict(env.settings)
+    settings = env.settings.facts()
     del settings["observation"]  # Each policy has its own.
     return {
         "command": shlex.join(["python", "-m", "avp_sb3.evaluate", *sys.argv[1:]]),

@@ -18,8 +18,8 @@ from avp_habitat.policies.saved_model import is_normalised, load_statistics, sta
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.simulators.registry import SimulatorChoice
-from avp_habitat.task.rewards import REWARD_NAMES
-from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
+from avp_habitat.task.rewards import REWARDS_HELP
+from avp_habitat.task.settings import OBSERVATIONS_HELP, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
 from avp_sb3.presets import MAP, PRESETS, Preset
 
@@ -35,8 +35,8 @@ class Train:
     """
 
     scene: Annotated[tuple[str, ...], arg(help=f"{SCENES}; agents share several")] = ("builtin:0",)
-    reward: Annotated[str, arg(help=", ".join(REWARD_NAMES))] = "proposed"
-    observation: Annotated[str, arg(help=f"{', '.join(OBSERVATION_NAMES)}; also chooses PPO's settings")] = "numbers"
+    reward: Annotated[str, arg(help=REWARDS_HELP)] = "proposed"
+    observation: Annotated[str, arg(help=f"{OBSERVATIONS_HELP}; also chooses PPO's settings")] = "numbers"
     metrics: Annotated[tuple[str, ...], arg(help=METRICS_HELP)] = ()
     steps: Annotated[int, Range(1, _MOST)] = 300_000
     """Environment steps in total."""

@@ -212,7 +212,7 @@ def test_unknown_floor_is_expected_near_free_floor_but_not_beyond_obstacles():
 def test_walks_are_the_shortest_and_do_not_cut_corners():
     navigable = np.ones((5, 5), dtype=bool)
     navigable[0:4, 2] = False
-    length, before = shortest_walks(navigable, np.array([0, 0]))
+    length, before = shortest_walks(navigable, 0, 0)
     route = route_to(before, np.array([0, 4]))
     # Diagonally to row 4 and back costs more: two diagonal steps beside the wall would cut its corner.
     assert length[0, 4] == pytest.approx(4 + 4 + 4 - 2 * (2 - np.sqrt(2)))
@@ -248,7 +248,7 @@ def test_the_frontier_baseline_walks_over_known_floor_only_and_towards_a_frontie
         known = known_map(view, stood[: number + 1])
         ahead = view.position - SETTINGS.forward_m * np.array([np.sin(view.yaw), 0.0, np.cos(view.yaw)])
         assert walkable(known.state != UNKNOWN, *known.at(view.position), *known.at(ahead))
-        length, _ = shortest_walks(known.navigable, known.at(view.position).astype(int))
+        length, _ = shortest_walks(known.navigable, *known.at(view.position).astype(int))
         frontiers = find_frontiers(known, np.zeros_like(known.state))
         assert any(np.isfinite(length[tuple(frontier.cells.T)]).any() for frontier in frontiers)
         walks += 1

@@ -135,8 +135,8 @@ def test_a_camera_that_never_moves_has_no_path(tmp_path, poses):
         (["--fps", "0"], 2, "--fps: expected a whole number from 1 to 240"),
         (["--width", "4"], 2, "--width: expected a whole number from 8 to 8,192, got 4"),
         (["--scale", "-1"], 2, "--scale: expected a number from 1e-06"),
-        (["--out", "{room}/rollout.json"], 2, "rollout.json exists; name another file"),
-        (["--out", "{room}/rollout.json/path.json"], 2, "--out: expected a place to write"),
+        (["--out", "{room}/rollout.json"], 2, "rollout.json: exists already"),
+        (["--out", "{room}/rollout.json/path.json"], 2, "path.json: cannot write there"),
     ],
 )
 def test_impossible_options_end_in_one_line(tmp_path, capsys, options, code, text):

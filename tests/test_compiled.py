@@ -85,7 +85,7 @@ def test_programs_that_are_started_use_the_same_folder_and_say_nothing(run, tmp_
 
 
 def test_the_doctor_says_where_compiled_code_is_kept(run, tmp_path):
-    code = "from avp_habitat.doctor.simulators import check_compiled as c; (f,) = c(); print(f.mark); print(f.text)"
+    code = "from avp_habitat.doctor.__main__ import check_compiled as c; (f,) = c(); print(f.mark); print(f.text)"
     (mark, text), _ = run(code)
     assert (mark, text.startswith(f"kept in {tmp_path}/avp-numba-")) == ("ok", True)
     (tmp_path / f"avp-numba-{os.getuid()}").chmod(0o777)

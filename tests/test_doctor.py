@@ -13,13 +13,8 @@ from pathlib import Path
 import pytest
 
 from avp_habitat import command
+from avp_habitat.doctor import ABSENT, BROKEN, OK, Finding, Plug, ask, check_host, check_python, read_manifest
 from avp_habitat.doctor import __main__ as doctor
-from avp_habitat.doctor import packages, simulators
-from avp_habitat.doctor.asking import ask
-from avp_habitat.doctor.finding import ABSENT, BROKEN, OK, Finding
-from avp_habitat.doctor.hosts import check_host
-from avp_habitat.doctor.manifest import Plug, read_manifest
-from avp_habitat.doctor.simulators import LPIPS_WEIGHTS
 
 ROOT = Path(__file__).resolve().parent.parent
 PLUGINS = tomllib.loads((ROOT / "plugins.toml").read_text(encoding="utf-8"))["plugin"]
@@ -74,7 +69,7 @@ def test_the_whole_suite_is_found_healthy_here(report):
 
 def test_a_version_out_of_range_is_a_line_with_the_fix(tmp_path):
     code = (
-        "from avp_habitat.doctor.packages import check_packages\n"
+        "from avp_habitat.doctor import check_packages\n"
         "for finding in check_packages(): print(finding.line(colour=False))"
     )
     done = run("-c", code, **with_packages(tmp_path, pygltflib="0.9"))
@@ -88,7 +83,7 @@ def test_something_broken_is_an_exit_code_of_1_and_a_line_on_standard_error(monk
         Finding(BROKEN, "second", "worn out; mend it"),
         Finding(ABSENT, "third", "-"),
     ]
-    checks = [doctor.Check(finding.subject, lambda finding=finding: [finding], 1.0) for finding in found]
+    checks = {finding.subject: lambda finding=finding: [finding] for finding in found}
     monkeypatch.setattr(doctor, "all_checks", lambda: checks)
     assert command.run(doctor.main, []) == 1
     said, complaint = capsys.readouterr()
@@ -129,7 +124,7 @@ def bare(tmp_path):
 
 def test_what_is_missing_of_an_extra_is_one_line_with_the_extra(bare):
     lines = bare(
-        "from avp_habitat.doctor.packages import check_packages\n"
+        "from avp_habitat.doctor import check_packages\n"
         "for finding in check_packages(): print(finding.line(colour=False))"
     )
     assert any(
@@ -142,7 +137,7 @@ def test_what_is_missing_of_an_extra_is_one_line_with_the_extra(bare):
 
 def test_a_host_that_is_not_installed_is_optional_and_says_how_to_get_it(bare):
     (line,) = bare(
-        "from avp_habitat.doctor.manifest import Plug; from avp_habitat.doctor.hosts import check_host\n"
+        "from avp_habitat.doctor import Plug, check_host\n"
         "plug = Plug('nerfstudio', 'nerfstudio.dataparser_configs', 'avp-data', 'a:b', 'true')\n"
         "print(check_host('nerfstudio', [plug])[0].line(colour=False))"
     )
@@ -160,14 +155,12 @@ def test_a_host_that_is_not_installed_is_optional_and_says_how_to_get_it(bare):
     ],
 )
 def test_a_program_that_does_not_answer_becomes_a_line(program, expected):
-    answer = ask(["-c", program], time_limit_s=2.0)
-    assert answer.value is None
-    assert answer.failure == expected
+    assert ask(["-c", program], time_limit_s=2.0) == (None, expected)
 
 
 def test_only_the_last_line_of_an_answer_counts():
     program = "import json, sys; print('noise'); print(json.dumps(json.load(sys.stdin)))"
-    assert ask(["-c", program], time_limit_s=30.0, question={"a": [1]}).value == {"a": [1]}
+    assert ask(["-c", program], time_limit_s=30.0, question={"a": [1]}) == ({"a": [1]}, None)
 
 
 def plug(host, group, name, obj):
@@ -225,12 +218,12 @@ def test_an_importer_that_is_not_on_the_path_says_what_to_export(importer, tmp_p
 
 def test_the_weights_of_lpips_are_looked_for_where_torch_keeps_them(monkeypatch, tmp_path):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    assert simulators.check_lpips()[0].mark == ABSENT
-    assert str(tmp_path / "hub" / "checkpoints") in simulators.check_lpips()[0].text
-    path = tmp_path / "hub" / "checkpoints" / LPIPS_WEIGHTS
+    assert doctor.check_lpips()[0].mark == ABSENT
+    assert str(tmp_path / "hub" / "checkpoints") in doctor.check_lpips()[0].text
+    path = tmp_path / "hub" / "checkpoints" / doctor.LPIPS_WEIGHTS
     path.parent.mkdir(parents=True)
     path.touch()
-    assert simulators.check_lpips() == [Finding(OK, "LPIPS weights", str(path))]
+    assert doctor.check_lpips() == [Finding(OK, "LPIPS weights", str(path))]
 
 
 def test_the_path_of_the_weights_is_the_one_that_reconstructions_use(monkeypatch, tmp_path):
@@ -241,11 +234,11 @@ def test_the_path_of_the_weights_is_the_one_that_reconstructions_use(monkeypatch
     path = lpips_weights_path()
     path.parent.mkdir(parents=True)
     path.touch()
-    assert simulators.check_lpips()[0].text == str(path)
+    assert doctor.check_lpips()[0].text == str(path)
 
 
 def test_the_python_of_this_environment_is_in_the_range_of_the_suite():
-    assert [finding.mark for finding in packages.check_python()] == [OK, OK]
+    assert [finding.mark for finding in check_python()] == [OK, OK]
 
 
 def test_a_wheel_brings_the_manifest_to_where_the_doctor_looks(tmp_path):
@@ -265,7 +258,7 @@ def test_a_wheel_brings_the_manifest_to_where_the_doctor_looks(tmp_path):
         archive.extractall(site)
     (data,) = site.glob("*.data/data")
     (data / "share").rename(tmp_path / "env" / "share")
-    code = "from avp_habitat.doctor import manifest as m; print(m.manifest_path(), len(m.read_manifest()))"
+    code = "from avp_habitat import doctor as m; print(m.manifest_path(), len(m.read_manifest()))"
     path = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
     installed = subprocess.run(
         [sys.executable, "-c", code],
@@ -281,6 +274,6 @@ def test_a_wheel_brings_the_manifest_to_where_the_doctor_looks(tmp_path):
 
 @pytest.mark.habitat
 def test_habitat_sim_is_really_opened_where_it_is_installed():
-    (finding,) = simulators.check_habitat()
+    (finding,) = doctor.check_simulator("habitat")
     assert finding.mark == OK, finding
     assert re.search(r"habitat-sim 0\.\d\.\d: opened builtin:0 and rendered in", finding.text)

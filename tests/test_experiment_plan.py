@@ -58,6 +58,36 @@ def test_the_users_number_of_starts_replaces_the_presets():
     assert found.preset == replace(PRESETS["smoke"], starts=4)
 
 
+def test_what_others_bring_is_a_method_and_a_figure_by_its_place(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "brought.py").write_text(
+        "from avp_habitat import Figure, metric, reward\n"
+        "class Still:\n"
+        "    def __init__(self, env, seed=None): ...\n"
+        "    def predict(self, observation, state=None, episode_start=None, deterministic=False): ...\n"
+        "@reward(needs_surface=True)\n"
+        "def thrifty(facts, constants): ...\n"
+        "@metric(Figure('turned', 'turned'))\n"
+        "def turned(trajectory): ...\n"
+    )
+    words = {"methods": "brought:thrifty_rooms,brought:Still,random", "metrics": "brought:turned", "unseen": "none"}
+    found = compare.Compare(preset="smoke", **words).configuration()
+    cells = plan(found, tmp_path, tracking="avp")
+    training, *rollouts = [cell for cell in cells if cell.kind != RECONSTRUCT]
+    assert training.name == "brought.thrifty_rooms-0"
+    assert [option(training, name) for name in ("--reward", "--observation", "--scene")] == [
+        "brought:thrifty",
+        "surface_map",
+        "builtin:100",
+    ]
+    assert [option(cell, "--policy") for cell in rollouts] == [
+        "random",
+        str(training.output(tmp_path)),
+        "brought:Still",
+    ]
+    assert {option(cell, "--metrics") for cell in rollouts} == {"brought:turned"}
+
+
 def test_more_starts_leave_what_is_there(tmp_path):
     few, more = (plan(configuration(starts=starts), tmp_path, tracking="avp") for starts in (1, 3))
     words = {cell.key: cell.words for cell in more}

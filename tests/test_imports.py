@@ -22,7 +22,7 @@ LIGHT = (
     "poses",
     "ranges",
     "rollout.format",
-    "rollout.png",
+    "rollout.images",
     "task.rewards",
     "task.trajectory",
 )

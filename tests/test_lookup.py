@@ -70,7 +70,7 @@ def test_cells_that_are_looked_up_are_those_that_rays_reach(room):
     by_ray, looked_up = np.zeros((2, 30, cells), dtype=np.int16)
     everyone, steps = np.arange(30), np.full(30, 7)
     from_rays = cast.capture(views, by_ray, everyone, steps)
-    from_tables = task._rooms[0].senses.capture(views, looked_up, everyone, steps)
+    from_tables = task._rooms[0].sensor.capture(views, looked_up, everyone, steps)
     assert by_ray.sum() > 0
     assert np.count_nonzero(by_ray != looked_up) <= 0.005 * np.count_nonzero(by_ray)
     np.testing.assert_array_equal(from_tables.new_cells, np.count_nonzero(looked_up, axis=1))

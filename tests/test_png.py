@@ -7,8 +7,7 @@ from PIL import Image
 
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout import images
-from avp_habitat.rollout.images import encode_png
-from avp_habitat.rollout.png import GREY_16, RGB_8, check_png_contents, check_png_structure
+from avp_habitat.rollout.images import GREY_16, RGB_8, check_png_contents, check_png_structure, encode_png
 from avp_habitat.rollout.writing import RolloutWriter
 
 CAMERA = Intrinsics.from_hfov(12, 8, hfov_deg=75)

@@ -24,7 +24,7 @@ from avp_habitat.rollout.images import DEPTH_UNIT_M
 from avp_sb3 import RerunCallback
 from avp_sb3.callbacks.base import MissingInfoError
 from avp_sb3.callbacks.rerun import RecordingError
-from avp_sb3.rerun.episode import Episode, log_episode, spread_indices
+from avp_sb3.rerun.episode import RecordedEpisode, log_episode, spread_indices
 
 
 class Notes(BaseCallback):
@@ -432,7 +432,7 @@ def test_on_a_large_floor_the_colours_change_less_often():
     first_seen = np.arange(cells) % (steps + 1)
     poses = np.tile(np.eye(4), (steps, 1, 1))
     camera = Intrinsics.from_hfov(16, 12, hfov_deg=90)
-    episode = Episode(poses, poses[:, :3, 3], camera, {}, {}, np.zeros((cells, 3)), first_seen)
+    episode = RecordedEpisode(poses, poses[:, :3, 3], camera, {}, {}, np.zeros((cells, 3)), first_seen)
     recording = rr.RecordingStream("avp", recording_id="large")
     memory = recording.memory_recording()
     log_episode(recording, "", episode, times={"episode": 1})

@@ -13,7 +13,7 @@ from avp_habitat.rollout.capture import capture_step, publish_rollout
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.rewards import (
-    REWARD_NAMES,
+    REWARDS,
     RewardConstants,
     StepFacts,
     find_reward,
@@ -85,7 +85,7 @@ def by_hand(name, facts, i):
     return new | {"spread": spread, "step": -c.step, "collision": collision, "redundancy": redundancy, "stop": stop}
 
 
-@pytest.mark.parametrize("name", REWARD_NAMES)
+@pytest.mark.parametrize("name", REWARDS)
 @given(seed=st.integers(0, 100_000))
 def test_every_part_equals_the_formula_by_hand(name, seed):
     facts = random_facts(seed)
@@ -96,7 +96,7 @@ def test_every_part_equals_the_formula_by_hand(name, seed):
 
 
 def test_only_the_proposed_and_the_surface_reward_have_a_stop():
-    assert [name for name in REWARD_NAMES if has_stop(find_reward(name))] == ["proposed", "surface"]
+    assert [name for name in REWARDS if has_stop(find_reward(name))] == ["proposed", "surface"]
 
 
 def test_stopping_needs_the_choice_and_the_coverage():

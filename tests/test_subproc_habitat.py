@@ -46,7 +46,7 @@ def test_rl_zoo3s_processes_take_turns_in_scenes():
         watched.step(np.zeros(2, dtype=np.int64))
     finally:
         watched.close()
-    assert [process.exitcode for process in venv.processes] == [0, 0]
+    assert [process.exitcode for process in watched.venv.processes] == [0, 0]
 
 
 def test_an_evaluation_opens_other_scenes_beside_the_trainings(tmp_path):

@@ -4,10 +4,10 @@ from stable_baselines3 import PPO
 
 from avp_habitat.policies.registry import make_policy_env
 from avp_habitat.task.env import AVPEnv
-from avp_habitat.task.settings import OBSERVATION_NAMES, TaskSettings
+from avp_habitat.task.settings import OBSERVATIONS, TaskSettings
 
 
-@pytest.mark.parametrize("kind", OBSERVATION_NAMES)
+@pytest.mark.parametrize("kind", OBSERVATIONS)
 def test_a_model_gets_the_observation_that_it_was_trained_on(kind, tmp_path):
     settings = TaskSettings(reward="surface", width=16, height=12, budget=4)
     simulator = Corridor()

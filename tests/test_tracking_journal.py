@@ -8,6 +8,7 @@ import pytest
 
 from avp_habitat.tracking import journal as module
 from avp_habitat.tracking.journal import VERSION, Journal
+from avp_habitat.tracking.stores import TrackingError
 
 HEADER = {
     "version": VERSION,
@@ -20,9 +21,14 @@ HEADER = {
 }
 
 
+@pytest.fixture(autouse=True)
+def spool(tmp_path, monkeypatch):
+    monkeypatch.setenv("AVP_MLFLOW_SPOOL", str(tmp_path))
+
+
 @pytest.fixture
-def journal(tmp_path):
-    made = Journal.create(tmp_path, HEADER)
+def journal():
+    made = Journal.create(HEADER)
     yield made
     made.release()
 
@@ -48,7 +54,7 @@ def test_entries_come_back_in_order_and_once(journal):
 
 
 def test_what_was_not_acknowledged_comes_again_also_to_the_next_process(tmp_path):
-    first = Journal.create(tmp_path, HEADER)
+    first = Journal.create(HEADER)
     for i in range(3):
         first.append({"tags": {"n": str(i)}})
     first.read()
@@ -63,15 +69,15 @@ def test_what_was_not_acknowledged_comes_again_also_to_the_next_process(tmp_path
     assert not (tmp_path / "k1").exists()
 
 
-def test_a_line_cut_off_by_a_power_cut_is_dropped_and_one_that_is_damaged_is_named(tmp_path):
-    first = Journal.create(tmp_path, HEADER)
+def test_a_line_that_a_power_cut_cut_off_or_damaged_is_dropped(tmp_path):
+    first = Journal.create(HEADER)
     first.append({"tags": {"n": "0"}})
     first.release()
     file = tmp_path / "k1" / "journal.jsonl"
     file.write_bytes(file.read_bytes() + b'\xff{"tags"\n' + b'{"tags": {"n": "lo')
     second = Journal.adopt(tmp_path / "k1")
     second.append({"tags": {"n": "1"}})
-    assert [entry.get("tags") for entry in drained(second)] == [{"n": "0"}, None, {"n": "1"}]
+    assert [entry["tags"] for entry in drained(second)] == [{"n": "0"}, {"n": "1"}]
     second.release()
 
 
@@ -111,32 +117,22 @@ def test_a_folder_that_is_no_journal_is_left_alone(tmp_path):
     assert list((tmp_path / "photos").iterdir()) == []
 
 
-def test_a_disk_that_takes_nothing_leaves_memory(tmp_path):
+def test_a_folder_that_takes_no_journal_is_an_error_that_names_the_way_out(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
-    journal = Journal.create(tmp_path / "file", HEADER)
-    assert "Not a directory" in journal.problem
-    journal.append({"tags": {"n": "0"}})
-    assert len(journal.read()) == 1
-    # Comes while the batch is on its way.
-    journal.append({"tags": {"n": "1"}})
-    journal.acknowledge()
-    with journal.new_file("a.bin") as path:
-        path.write_bytes(b"1")
-    assert path.read_bytes() == b"1"
-    assert drained(journal) == [{"tags": {"n": "1"}}]
-    journal.release()
-    assert not path.exists()
+    monkeypatch.setenv("AVP_MLFLOW_SPOOL", str(tmp_path / "file"))
+    with pytest.raises(TrackingError, match=r"file/k1: cannot be written: Not a directory; .* in AVP_MLFLOW_SPOOL$"):
+        Journal.create(HEADER)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 # A limit on the size of files, which stands for a full disk, holds for a whole process.
 FULL = """
 import resource, sys
-from pathlib import Path
-sys.path.insert(0, sys.argv[2])
+sys.path.insert(0, sys.argv[1])
 from test_tracking_journal import HEADER, drained
 from avp_habitat.tracking.journal import Journal
 
-journal = Journal.create(Path(sys.argv[1]), HEADER)
+journal = Journal.create(HEADER)
 soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
 entries = [{"tags": {"n": str(i), "text": "x" * 200}} for i in range(30)]
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
@@ -157,8 +153,8 @@ assert journal.problem is None
 """
 
 
-def test_a_full_disk_costs_nothing_while_the_process_lives(tmp_path):
+def test_a_full_disk_costs_nothing_while_the_process_lives():
     done = subprocess.run(
-        [sys.executable, "-c", FULL, tmp_path, Path(__file__).parent], capture_output=True, text=True, cwd=os.getcwd()
+        [sys.executable, "-c", FULL, Path(__file__).parent], capture_output=True, text=True, cwd=os.getcwd()
     )
     assert done.returncode == 0, done.stderr

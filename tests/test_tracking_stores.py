@@ -12,13 +12,14 @@ import mlflow
 import pytest
 from mlflow import MlflowClient
 from no_rights import without_root_rights
+from sqlalchemy.engine import URL
 from tracking import mlflow_home
 
 from avp_habitat import command
 from avp_habitat.tracking import compare
 from avp_habitat.tracking.experiments import chosen_experiment, experiment_id
 from avp_habitat.tracking.run import NewRun, start_run
-from avp_habitat.tracking.stores import TrackingError, absolute, connect, file_of, sqlite_address
+from avp_habitat.tracking.stores import TrackingError, absolute, connect, file_of
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -185,7 +186,7 @@ def test_a_database_that_another_program_left_half_made_is_recognised(store, tmp
 def test_a_database_is_made_where_mlflow_looks_for_it_whatever_its_path_holds(tmp_path, folder):
     """SQLAlchemy reads `%20` in an address as a space."""
     path = tmp_path / folder / "mlflow.db"
-    address = sqlite_address(path)
+    address = URL.create("sqlite", database=str(path)).render_as_string()
     assert file_of(address) == path
     assert absolute(address) == address
     made = connect(address).create_experiment("é")

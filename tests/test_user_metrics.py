@@ -87,10 +87,9 @@ def test_a_metric_that_gives_no_number_is_refused():
 
 
 def test_figures_are_the_suites_and_the_chosen_ones():
-    find_metrics((turned_deg,))
-    shown = figures()
+    shown = figures((turned_deg,))
     assert [*shown][: len(FIGURES)] == [*FIGURES]
-    assert figure_of("turned_deg") == turned_deg.figure
+    assert shown["turned_deg"] == turned_deg.figure
     assert figure_of("never_heard_of").heading == "never heard of"
     assert shown["turned_deg"].heading == "turned [°]"
     assert shown["turned_deg"].text(30.4, 2.6) == "30 ± 3"

@@ -25,6 +25,7 @@ from avp_habitat.rollout.format import read_rollout
 from avp_habitat.task.env import AVPEnv
 from avp_sb3 import hyperparams, zoo
 from avp_sb3.vec_env.batched import AVPVecEnv
+from avp_sb3.vec_env.subproc import AVPSubprocVecEnv
 
 SMALL = {"scene": "builtin:0", "width": 16, "height": 12, "budget": 6}
 
@@ -126,82 +127,80 @@ def test_environments_that_cannot_be_batched_are_refused_in_one_line():
         zoo.Batched(zoo_envs(2), scenes=["builtin:1", "nowhere.glb"])
 
 
+def processes(n=2, **changes):
+    """Environments in processes of their own, as rl_zoo3 makes them."""
+    return zoo_envs(n, vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "forkserver"}, **changes)
+
+
 @pytest.mark.slow
-def test_processes_give_the_same_numbers_and_take_turns_in_the_given_scenes(capsys):
-    processes = zoo_envs(2, vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "forkserver"})
-    watched = zoo.Batched(processes)
+def test_processes_give_the_same_numbers_and_take_turns_in_the_given_scenes(tmp_path):
+    old = processes(monitor_dir=str(tmp_path))
+    batch = zoo.Batched(old, lookup=False)
     try:
-        assert watched.venv is processes
-        assert "in processes of their own" in capsys.readouterr().out
-        assert_same_walk(watched, zoo_envs(2))
+        assert isinstance(batch.venv, AVPSubprocVecEnv)
+        assert len(batch.venv.processes) == 2
+        assert old.closed
+        assert_same_walk(batch, zoo_envs(2))
     finally:
-        watched.close()
+        batch.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["monitor.csv"]
+    assert len((tmp_path / "monitor.csv").read_text().splitlines()) == 2 + 2 * 2
     scenes = ["builtin:1", "builtin:2"]
-    watched = zoo.Batched(zoo_envs(2, vec_env_cls=SubprocVecEnv), scenes=scenes)
+    batch = zoo.Batched(processes(), scenes=scenes)
     try:
-        assert watched.get_attr("scene_name") == watched.venv.get_attr("scene_name") == scenes
-        assert_same_walk(watched, zoo.Batched(zoo_envs(2), scenes=scenes, lookup=False))
+        assert batch.get_attr("scene_name") == scenes
+        assert batch.get_attr("settings")[0].lookup
+        assert_same_walk(batch, zoo.Batched(zoo_envs(2), scenes=scenes))
     finally:
-        watched.close()
+        batch.close()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("changes", "scenes", "error"),
+    ("scenes", "error"),
     [
-        ({"scene": "gone.glb"}, [], r"gone\.glb: no such scene file.* \[worker 0 of 2\]"),
-        ({"reward": "cover"}, [], r"unknown reward 'cover'.* \[worker 0 of 2\]"),
-        ({}, ["builtin:1", "gone.glb"], r"gone\.glb: no such scene file"),
-        ({}, ["builtin:1", "builtin:2", "builtin:3"], "one environment for each of the 3 scenes, got 2"),
+        (["builtin:1", "gone.glb"], r"gone\.glb: no such scene file"),
+        (["builtin:1", "builtin:2", "builtin:3"], "one environment for each of the 3 scenes, got 2"),
     ],
 )
-def test_what_fails_in_a_process_is_one_error_of_the_parent(changes, scenes, error):
-    processes = zoo_envs(2, vec_env_cls=SubprocVecEnv, **changes)
+def test_scenes_that_cannot_be_are_one_error_of_the_parent(scenes, error):
     with pytest.raises((SceneError, UsageError), match=error):
-        zoo.Batched(processes, scenes=scenes)
-    assert [process.exitcode for process in processes.processes] == [0, 0]
+        zoo.Batched(processes(), scenes=scenes)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("line", "last", "processes_say"),
+    ("kwargs", "told"),
     [
-        ("zoo.Batched(venv)", "avp_habitat.errors.SceneError: gone.glb: no such scene file", []),
-        ("venv.reset()", "EOFError", ["error: gone.glb: no such scene file"] * 2),
+        ({"scene": "gone.glb"}, "error: gone.glb: no such scene file"),
+        ({"reward": "cover"}, "error: unknown reward 'cover'"),
     ],
 )
-def test_processes_without_a_scene_end_in_one_line_at_most(tmp_path, line, last, processes_say):
+def test_processes_that_cannot_begin_say_why_in_one_line_each(tmp_path, kwargs, told):
     code = f"""
 import avp_habitat, gymnasium
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
-from avp_sb3 import zoo
 spec = gymnasium.spec(avp_habitat.ENV_ID)
-venv = make_vec_env(spec.make, n_envs=2, env_kwargs={{"scene": "gone.glb"}}, vec_env_cls=SubprocVecEnv)
-try:
-    {line}
-finally:
-    for process in venv.processes:
-        process.join(5)
+make_vec_env(spec.make, n_envs=2, env_kwargs={kwargs!r}, vec_env_cls=SubprocVecEnv)
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=100)
-    told = done.stderr.splitlines()
-    assert told[-1].startswith(last)
-    own = told[: told.index("Traceback (most recent call last):")]
-    assert [text.partition(" (")[0] for text in own] == processes_say
-    assert done.stderr.count("Process ForkServerProcess") == 0, "that is how a traceback of a process begins"
+    lines = done.stderr.splitlines()
+    assert sum(line.startswith(told) for line in lines) >= 1, "the other process may be ended before it can say it"
+    assert lines[-1].startswith(("EOFError", "ConnectionResetError", "BrokenPipeError"))
+    assert "Process ForkServerProcess" not in done.stderr, "that is how a traceback of a process begins"
 
 
 @pytest.mark.slow
 def test_a_killed_process_is_named_with_its_scene_and_the_others_are_ended():
-    watched = zoo.Batched(zoo_envs(2, vec_env_cls=SubprocVecEnv))
-    watched.reset()
-    os.kill(watched.venv.processes[1].pid, signal.SIGKILL)
+    batch = zoo.Batched(processes())
+    batch.reset()
+    os.kill(batch.venv.processes[1].pid, signal.SIGKILL)
     with pytest.raises(SimulatorError, match=r"worker 1 of 2 \(scene builtin:0\) was killed by SIGKILL"):
-        walk(watched)
-    assert [process.exitcode for process in watched.venv.processes] == [0, -9]
-    assert watched.get_attr("area", [1])[0].area_m2 > 1, "an interrupted run is still drawn"
-    watched.close()
+        walk(batch)
+    assert [process.exitcode for process in batch.venv.processes] == [0, -9]
+    assert batch.get_attr("area", [1])[0].area_m2 > 1, "an interrupted run is still drawn"
+    batch.close()
 
 
 @pytest.fixture
@@ -269,7 +268,6 @@ def test_the_commands_train_in_processes_enjoy_and_record(home):
     few = ["-n", "64", "--vec-env", "subproc", "-params", "n_envs:2", "n_steps:32", "batch_size:32", "n_epochs:1"]
     trained = subprocess.run(line("train", *TRAIN, *few), cwd=home, capture_output=True, text=True, timeout=300)
     assert trained.returncode == 0, trained.stderr
-    assert "in processes of their own" in trained.stdout
     for changes, words in (({}, ""), ({"record": "enjoyed"}, r"enjoyed: \d views, coverage")):
         enjoy = line("enjoy", "--no-render", "-n", "13", **changes)
         enjoyed = subprocess.run(enjoy, cwd=home, capture_output=True, text=True, timeout=300)

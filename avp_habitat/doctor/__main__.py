@@ -1,104 +1,147 @@
 """Command line of the doctor: all checks side by side, one line each in a fixed order."""
 
-import argparse
-import contextlib
 import dataclasses
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 from avp_habitat import command
-from avp_habitat.doctor import packages, simulators
-from avp_habitat.doctor.asking import stop_all
-from avp_habitat.doctor.finding import BROKEN, Finding
-from avp_habitat.doctor.hosts import check_host
-from avp_habitat.doctor.manifest import read_manifest
-from avp_habitat.errors import AVPError
+from avp_habitat.doctor import ABSENT, BROKEN, OK, Finding, ask, check_host, check_packages, check_python, read_manifest
+from avp_habitat.errors import AVPError, SimulatorError
+from avp_habitat.provenance import version_of
+from avp_habitat.simulators.habitat.graphics import FIRST_DEVICE, choose_gpu, inspect_graphics
+from avp_habitat.simulators.habitat.installed import inspect_installation, require_installed
+
+LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"
+# One of the suite's kernels stands for all.
+_COMPILED = "import json; from avp_habitat.task.floor_map import draw as f; print(json.dumps(f.stats.cache_path))"
+_TORCH = (
+    "import json, torch; there = torch.cuda.is_available(); "
+    "print(json.dumps([torch.__version__, torch.version.cuda, torch.cuda.get_device_name() if there else None]))"
+)
+Check = Callable[[], list[Finding]]
 
 
-@dataclass(frozen=True)
-class Check:
-    """One check, which gives one or more lines."""
+def check_simulator(name: str) -> list[Finding]:
+    """Whether a simulator opens the built-in room and renders, or why not."""
+    subject = f"simulator {name}"
+    try:
+        if name == "habitat":
+            require_installed()
+    except SimulatorError as error:
+        return [Finding(BROKEN if inspect_installation().installed else ABSENT, subject, str(error))]
+    words = ["-m", "avp_habitat.doctor.probe", "simulator", name]
+    answer, failure = ask(words, time_limit_s=120.0)
+    if failure is not None:
+        return [Finding(BROKEN, subject, f"{failure}; the whole message: python {' '.join(words)}")]
+    if "error" in answer:
+        return [Finding(BROKEN, subject, answer["error"])]
+    return [Finding(OK, subject, "{version}: opened builtin:0 and rendered in {seconds:.1f} s".format_map(answer))]
 
-    name: str
-    """For the progress line."""
-    run: Callable[[], list[Finding]]
-    """Does it."""
-    seconds: float
-    """About how long it takes; the long ones are started first."""
+
+def check_graphics() -> list[Finding]:
+    """The device that `--gpu` takes by itself. Only Habitat-Sim needs one."""
+    try:
+        gpu = choose_gpu(None)
+    except SimulatorError as error:
+        needed = inspect_installation().installed
+        text = str(error).removeprefix("habitat: ")
+        return [Finding(BROKEN if needed else ABSENT, "graphics (EGL)", text if needed else f"{text} (habitat only)")]
+    state = inspect_graphics(inspect_graphics().index_of(gpu))
+    renderer = state.context.renderer if state.context else "unknown"
+    others = [str(number) for number in state.cuda_numbers if number != gpu]
+    also = f"; also --gpu {', '.join(others)}" if others else ""
+    kind = "EGL's first device" if gpu == FIRST_DEVICE else f"CUDA device {gpu}"
+    return [Finding(OK, "graphics (EGL)", f"--gpu takes {gpu}: {kind}, {renderer}{also}")]
 
 
-class Broken(AVPError):
-    """Something of what the suite needs does not work; exit code 1."""
+def check_compiled() -> list[Finding]:
+    """Where Numba keeps the suite's compiled kernels; without any place each program compiles them again."""
+    subject, (place, failure) = "compiled code", ask(["-c", _COMPILED], time_limit_s=60.0)
+    if failure is not None:
+        return [Finding(BROKEN, subject, f"{failure}; pip install --force-reinstall numba")]
+    if place is None:
+        text = "cannot be kept, so that each program compiles for half a minute; name a folder in NUMBA_CACHE_DIR"
+        return [Finding(ABSENT, subject, text)]
+    return [Finding(OK, subject, f"kept in {place}; NUMBA_CACHE_DIR names another folder")]
 
 
-def all_checks() -> list[Check]:
-    """The checks in the order of the report."""
+def check_cuda() -> list[Finding]:
+    """PyTorch's CUDA, which nerfstudio wants; the suite and PPO run without."""
+    subject = "CUDA for torch"
+    if version_of("torch") is None:
+        return [Finding(ABSENT, subject, "torch is not installed; pip install 'avp-suite[nerfstudio]'")]
+    found, failure = ask(["-c", _TORCH], time_limit_s=60.0)
+    if failure is not None:
+        text = f"import torch: {failure}; install torch and torchvision together from the package index"
+        return [Finding(BROKEN, subject, text)]
+    version, built, device = found
+    if device is not None:
+        return [Finding(OK, subject, f"torch {version} on {device}")]
+    why = f"built for CUDA {built}, but finds no device" if built else "built without CUDA"
+    text = f"torch {version} is {why}; ns-train runs on the CPU: --machine.device-type cpu"
+    return [Finding(ABSENT, subject, text)]
+
+
+def check_lpips() -> list[Finding]:
+    """AlexNet's weights, without which a reconstruction's LPIPS needs the network."""
+    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    home = Path(os.path.expanduser(os.environ.get("TORCH_HOME") or f"{cache}/torch"))
+    path = home / "hub" / "checkpoints" / LPIPS_WEIGHTS
+    if path.is_file():
+        return [Finding(OK, "LPIPS weights", str(path))]
+    text = f"not in {path.parent}: downloaded when first needed; without network put {LPIPS_WEIGHTS} there, or set "
+    return [Finding(ABSENT, "LPIPS weights", f"{text}TORCH_HOME to a folder that holds it in hub/checkpoints")]
+
+
+def all_checks() -> dict[str, Check]:
+    """The checks by name, in the order of the report."""
     plugs = read_manifest()
-    weights = {"nerfstudio": 8.0, "mlflow": 4.0, "rl_zoo3": 4.0, "stable-baselines3": 3.0}
-    hosts = [
-        Check(host, lambda host=host: check_host(host, [plug for plug in plugs if plug.host == host]), seconds)
-        for host in dict.fromkeys(plug.host for plug in plugs)
-        for seconds in [weights.get(host, 1.0)]
-    ]
-    return [
-        Check("Python", packages.check_python, 0.0),
-        Check("packages", packages.check_packages, 0.0),
-        Check("numba", simulators.check_compiled, 2.0),
-        Check("raycast", simulators.check_raycast, 5.0),
-        Check("habitat", simulators.check_habitat, 7.0),
-        Check("graphics", simulators.check_graphics, 0.3),
-        Check("torch", simulators.check_cuda, 3.0),
-        Check("LPIPS", simulators.check_lpips, 0.0),
-        *hosts,
-    ]
+    hosts = dict.fromkeys(plug.host for plug in plugs)
+    return {
+        "Python": check_python,
+        "packages": check_packages,
+        "numba": check_compiled,
+        "raycast": partial(check_simulator, "raycast"),
+        "habitat": partial(check_simulator, "habitat"),
+        "graphics": check_graphics,
+        "torch": check_cuda,
+        "LPIPS": check_lpips,
+        **{host: partial(check_host, host, [plug for plug in plugs if plug.host == host]) for host in hosts},
+    }
 
 
-def findings_of(checks: Sequence[Check]) -> Iterator[Finding]:
+def findings_of(checks: Mapping[str, Check]) -> Iterator[Finding]:
     """The findings in the order of the checks, each as soon as it and those before it are known."""
     pool = ThreadPoolExecutor(max_workers=max(3, os.cpu_count() or 1))
-    longest_first = sorted(checks, key=lambda check: -check.seconds)
-    futures = {check.name: pool.submit(check.run) for check in longest_first}
+    futures = {name: pool.submit(check) for name, check in checks.items()}
     try:
-        for check in checks:
-            with _waiting_for(check.name, futures[check.name]):
-                found = futures[check.name].result()
-            yield from found
+        for name, future in futures.items():
+            if sys.stderr.isatty() and not future.done():
+                print(f"looking at {name} ...\033[K", end="\r", file=sys.stderr, flush=True)
+            yield from future.result()
     finally:
-        stop_all()
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-@contextlib.contextmanager
-def _waiting_for(name: str, future: "Future[list[Finding]]") -> Iterator[None]:
-    """Show on a terminal's last line what is being waited for."""
-    text = f"looking at {name} ..." if sys.stderr.isatty() and not future.done() else ""
-    print(text, end="\r" if text else "", file=sys.stderr, flush=True)
-    try:
-        yield
-    finally:
-        print(" " * len(text), end="\r" if text else "", file=sys.stderr, flush=True)
+@dataclass(frozen=True)
+class Doctor:
+    """What is installed, what can run here and what the hosts see: ok, -- (not here, optional), !! (broken).
 
-
-def main(argv: Sequence[str]) -> None:
-    """Run every check and print what was found.
-
-    Args:
-        argv: command-line arguments.
-
-    Raises:
-        Broken: a check found something broken.
+    Exit code 1 when anything is broken.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m avp_habitat.doctor",
-        description="What is installed, what can run here and what the hosts see: ok, -- (not here, optional), !! "
-        "(broken). Exit code 1 when anything is broken.",
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of lines")
-    options = parser.parse_args(argv)
+
+    json: bool = False
+    """Print one JSON object instead of lines."""
+
+
+def main(options: Doctor) -> None:
+    """Run every check and print what was found; an error when something is broken."""
     found = []
     for finding in findings_of(all_checks()):
         found.append(finding)
@@ -108,7 +151,7 @@ def main(argv: Sequence[str]) -> None:
     if options.json:
         print(json.dumps({"ok": not broken, "findings": [dataclasses.asdict(finding) for finding in found]}, indent=2))
     if broken:
-        raise Broken(f"broken: {', '.join(broken)}; what to do stands in the lines marked {BROKEN}")
+        raise AVPError(f"broken: {', '.join(broken)}; what to do stands in the lines marked {BROKEN}")
 
 
 if __name__ == "__main__":

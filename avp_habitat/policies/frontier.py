@@ -26,6 +26,15 @@ LEAST_CELLS = 3
 TRIES = 8
 """After this many views that should have observed a navigable cell, planners take it for hidden."""
 
+LOYALTY_MOVES = 3.0
+"""Another frontier must be this many moves nearer than the one approached before."""
+SAME_M = 0.5
+"""A frontier this close to the one approached before is what is left of it, metres."""
+LOOK_M = 1.0
+"""The agent does not turn to look at frontiers nearer than this: it sees them from elsewhere, metres."""
+
+Float = NDArray[np.float64]
+
 _EIGHT = np.ones((3, 3), dtype=np.bool_)
 
 
@@ -40,12 +49,7 @@ class Frontier:
 
 
 def find_frontiers(known: KnownMap, misses: NDArray[np.uint8]) -> list[Frontier]:
-    """The frontiers of a map, in the order of their first cells.
-
-    Args:
-        known: the map.
-        misses: `(rows, columns)` views that should have observed a cell which is still not observed.
-    """
+    """The frontiers of a map, in the order of their first cells; `misses` as `Memory.update` gives it."""
     from scipy.ndimage import binary_dilation, label
 
     unobserved = (known.state == FREE) & (misses < TRIES)
@@ -58,16 +62,6 @@ def find_frontiers(known: KnownMap, misses: NDArray[np.uint8]) -> list[Frontier]
             edge = unobserved & binary_dilation(group, _EIGHT)
             found.append(Frontier(np.argwhere(group), np.argwhere(edge)))
     return found
-
-
-LOYALTY_MOVES = 3.0
-"""Another frontier must be this many moves nearer than the one approached before."""
-SAME_M = 0.5
-"""A frontier this close to the one approached before is what is left of it, metres."""
-LOOK_M = 1.0
-"""The agent does not turn to look at frontiers nearer than this: it sees them from elsewhere, metres."""
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -115,7 +109,7 @@ class _Here:
         self._lens = make_lens(view.settings, known.cell_m)
         self._half_view = np.radians(view.settings.hfov_deg) / 2
         self._navigable = known.navigable
-        self._length, self._before = shortest_walks(self._navigable, self._at.astype(np.int64))
+        self._length, self._before = shortest_walks(self._navigable, *map(int, self._at))
 
     def way_to(self, frontier: Frontier) -> _Way | None:
         lengths = self._length[tuple(frontier.cells.T)]

@@ -14,6 +14,17 @@ from avp_habitat.sight.bits import ONE, size
 from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.settings import LOOK_DOWN, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT
 
+HORIZON = 12
+"""Moves that the search looks ahead."""
+COMMITTED = 3
+"""Moves that are made before the next search."""
+DISCOUNT = 0.95
+"""What a cell counts less for every move by which it is observed later."""
+BEYOND_M = 0.5
+"""Unknown floor within this distance of known floor is expected to be navigable, metres."""
+UNKNOWN_TRIES = 3
+"""After this many views that should have observed an unknown cell, it is taken for not navigable."""
+
 _MOST_PLACES = 600
 _MERGED = 2
 """Places in the same square of this many cells a side are one."""
@@ -77,7 +88,7 @@ def search(
     horizon: int,
     discount: float,
 ) -> tuple[list[int], float]:
-    """The moves (forward and turns) whose views should newly observe most.
+    """The moves (forward and turns) whose views should newly observe most; none when nothing is gained.
 
     The search walks through known navigable cells only. Of the ways that lead to the same place and heading with the
     fewest moves it keeps the one that gains most, so that its effort grows with the reachable poses, not with the
@@ -89,11 +100,10 @@ def search(
         start: where the agent is.
         lens: of the camera.
         horizon: greatest number of moves.
-        discount: the gain of a way is the sum over its views of the newly observed cells times
-            `discount ** (moves before the view's own)`.
+        discount: what a cell counts less for every move by which it is observed later.
 
     Returns:
-        The moves and their gain; no moves when nothing is gained.
+        The moves, and their gain: newly observed cells times `discount ** (moves before the view)`.
     """
     if not len(cells) or horizon < 1:
         return [], 0.0
@@ -226,27 +236,11 @@ def _way(tree, node):
     return moves
 
 
-HORIZON = 12
-"""Moves that the search looks ahead."""
-COMMITTED = 3
-"""Moves that are made before the next search."""
-DISCOUNT = 0.95
-"""What a cell counts less for every move by which it is observed later."""
-BEYOND_M = 0.5
-"""Unknown floor within this distance of known floor is expected to be navigable, metres."""
-UNKNOWN_TRIES = 3
-"""After this many views that should have observed an unknown cell, it is taken for not navigable."""
-
-
 def expected_cells(known: KnownMap, misses: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Cells that are probably navigable and not observed yet: free ones, and unknown ones a little beyond them.
+    """`(rows, columns)` whether cells are probably navigable and not observed yet.
 
-    Args:
-        known: the map.
-        misses: `(rows, columns)` views that should have observed a cell which is still not observed.
-
-    Returns:
-        `(rows, columns)`; unknown cells that known obstacles cut off do not count.
+    These are free ones, and unknown ones a little beyond them that no known obstacle cuts off, less those that as many
+    views as `misses` allows, `(rows, columns)`, should have observed.
     """
     from scipy.ndimage import binary_dilation
 

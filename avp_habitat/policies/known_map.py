@@ -43,15 +43,11 @@ class KnownMap:
 
 
 def known_map(view: AgentView, stood: NDArray[np.float64]) -> KnownMap:
-    """What an agent knows about the floor.
+    """What an agent that has stood at `(k, 3)` places in metres knows about the floor.
 
     An observed cell is navigable, and the depth image around its floor point shows which of its 8 neighbours are;
     around its own body the agent knows the cells within `BODY_M`. Nothing else of the scene is read: the grid's size
     follows from these cells too.
-
-    Args:
-        view: the agent.
-        stood: `(k, 3)` where it has stood in this episode, metres.
     """
     area = view.area
     observed = area.cell_of(area.centres[view.observed])
@@ -74,21 +70,6 @@ def _around(cells: NDArray[np.int64], radius: float) -> NDArray[np.int64]:
     offsets = np.argwhere(np.ones((2 * reach + 1,) * 2)) - reach
     offsets = offsets[np.hypot(*offsets.T) <= radius + 1e-9]
     return (np.unique(cells, axis=0)[:, None] + offsets).reshape(-1, 2)
-
-
-def shortest_walks(
-    navigable: NDArray[np.bool_], start: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Dijkstra over 8-connected cells, without cutting corners.
-
-    Args:
-        navigable: `(rows, columns)`.
-        start: `(2,)` row and column; it need not be navigable.
-
-    Returns:
-        `(rows, columns)` lengths in cells, inf where unreachable, and the flat index of the cell before, -1 for none.
-    """
-    return _shortest_walks(navigable, int(start[0]), int(start[1]))
 
 
 def route_to(before: NDArray[np.int64], goal: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -127,7 +108,12 @@ def walkable(cells, row, column, to_row, to_column):
 
 
 @njit(cache=True)
-def _shortest_walks(navigable, start_row, start_column):
+def shortest_walks(navigable, start_row, start_column):
+    """Dijkstra over 8-connected cells `(rows, columns)`, without cutting corners; the start need not be navigable.
+
+    Returns:
+        `(rows, columns)` lengths in cells, inf where unreachable, and the flat index of the cell before, -1 for none.
+    """
     rows, columns = navigable.shape
     length = np.full((rows, columns), np.inf)
     before = np.full((rows, columns), -1, np.int64)

@@ -12,6 +12,8 @@ from avp_habitat.task.settings import ACTION_NAMES, MOVE_FORWARD, TURN_LEFT, TUR
 
 CLEARANCE_M = 1.0
 """The heuristic walks on while the depth at the image centre is above this (Eq. 23), metres."""
+WALK_M = 2.0
+"""Length of a walk between two full circles, metres."""
 
 
 class RandomPolicy:
@@ -69,10 +71,6 @@ class HeuristicPolicy:
         turn = np.where(self._rng.random(len(depth)) < 0.5, TURN_LEFT, TURN_RIGHT)
         action = np.where(depth > CLEARANCE_M, MOVE_FORWARD, turn).astype(np.int64)
         return action.reshape(action_shape(observation, len(depth))), None
-
-
-WALK_M = 2.0
-"""Length of a walk between two full circles, metres."""
 
 
 class SpinPlanner:

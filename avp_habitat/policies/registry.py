@@ -50,7 +50,8 @@ POLICIES = {
     "survey": "avp_habitat.policies.oracle.policy:SurveyPolicy.for_env",
 }
 """The baselines by name: each is a function of (env, seed) that gives a `Policy`."""
-POLICY_NAMES = tuple(POLICIES)
+POLICIES_HELP = f"{', '.join(POLICIES)}, MODULE:OBJECT, or a model (.zip)"
+"""Help of the option `--policy`."""
 TRUSTED = "open a model also where that may run code which its file holds: only if you know who made it"
 """Help of the option `--trusted`."""
 

@@ -26,9 +26,15 @@ from avp_habitat.task.settings import ACTION_NAMES
 from avp_habitat.task.trajectory import Trajectory
 
 VIEWS = 20
+"""Held-out views of a rollout."""
 PITCH_DEG = 20.0
+"""Their greatest pitch, either way."""
 MIN_MEAN_DEPTH_M = 1.0
+"""A view that sees no farther on average has its nose on a wall."""
+
 _TRIES = 2000
+_VERSIONED = ("avp-suite", "numpy", "gymnasium", "open3d", "pillow", "stable-baselines3", "torch")
+_FLOOR_FILE = "floor.png"
 
 
 def heldout_seed(scene_digest: str) -> int:
@@ -38,8 +44,6 @@ def heldout_seed(scene_digest: str) -> int:
 
 def heldout_poses(simulator: Simulator, *, sensor_height_m: float, views: int = VIEWS) -> NDArray[np.float64]:
     """Poses uniform over the navigable area, any yaw, pitch within ±20°, that see at least 1 m far on average.
-
-    A camera with its nose on a wall shows nothing that a reconstruction could be judged by, hence the last rule.
 
     Args:
         simulator: of the scene.
@@ -67,10 +71,6 @@ def heldout_poses(simulator: Simulator, *, sensor_height_m: float, views: int = 
         f"{simulator.scene}: found only {len(found)} of {views} held-out views that see at least "
         f"{MIN_MEAN_DEPTH_M} m far on average; is the scene in metres?"
     )
-
-
-_VERSIONED = ("avp-suite", "numpy", "gymnasium", "open3d", "pillow", "stable-baselines3", "torch")
-_FLOOR_FILE = "floor.png"
 
 
 def capture_step(env: AVPEnv, writer: RolloutWriter, action: int, reward: float, info: dict[str, Any]) -> None:

@@ -1,6 +1,5 @@
-"""Reading a rollout folder, with every fault of it named.
+"""Reading a rollout folder, with every fault of it named; `rollout.writing` makes it.
 
-The folder is the contract between the halves of the suite (capturing and reconstructing); `rollout_writer` makes it.
 Nothing is decoded here: pictures are checked by their first and last bytes, so that thousands of frames cost a second.
 """
 
@@ -8,7 +7,6 @@ import json
 import os
 import reprlib
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -18,7 +16,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import RolloutError
 from avp_habitat.poses import Intrinsics, rigidity_fault
-from avp_habitat.rollout.png import GREY_16, RGB_8, check_png_contents, check_png_structure
+from avp_habitat.rollout.images import GREY_16, RGB_8, check_png_contents, check_png_structure
 
 FORMAT = "avp-rollout"
 FORMAT_VERSION = 1
@@ -27,8 +25,7 @@ POSE_CONVENTION = (
     "camera axes habitat (= OpenGL): x right, y up, looks along -z"
 )
 HELDOUT = "heldout"
-# A pose that is rigid within this is so within the tolerance of `rigidity_fault`, which decides on all others.
-_CLEARLY_RIGID = 5e-5
+
 # Of 16 numbers, written with all their digits; a pose file longer than this is none.
 _LONGEST_POSE_BYTES = 4096
 # Beyond any size in pixels or metres.
@@ -88,6 +85,12 @@ def frame_name(index: int) -> str:
     return f"frame_{index:05d}"
 
 
+def view_of(base: Path, index: int, pose: NDArray[np.float64]) -> View:
+    """A view by its number and pose, in a rollout's folder or that of its held-out views."""
+    name = f"{frame_name(index)}.png"
+    return View(base / "images" / name, base / "depth" / name, pose)
+
+
 def read_rollout(folder: str | Path) -> Rollout:
     """Read and check a rollout.
 
@@ -127,7 +130,9 @@ def read_meta(folder: Path) -> dict[str, Any]:
             f"avp-suite {writer}; collect it again or read it with that version"
         )
     _check_facts(path, meta)
-    _check_origin(path, _of(meta, "scene").get("origin", [0, 0, 0]))
+    origin = _of(meta, "scene").get("origin", [0, 0, 0])
+    if not _are_lengths(origin, 3):
+        raise _unlike(path, "scene.origin", "three lengths in metres", origin)
     _intrinsics(path, meta)
     for key in ("frames", HELDOUT):
         _count(folder, meta, key)
@@ -174,7 +179,11 @@ def _check_values(path: Path, value: Any, name: str, depth: int) -> None:
         for index, entry in enumerate(value):
             _check_values(path, entry, f"{name}[{index}]", depth + 1)
     elif isinstance(value, int | float) and not abs(value) <= sys.float_info.max:
-        raise RolloutError(f"{path}: expected {name} to be a finite number, found {reprlib.repr(value)}")
+        raise _unlike(path, name, "a finite number", value)
+
+
+def _unlike(path: Path, name: str, expected: str, found: Any) -> RolloutError:
+    return RolloutError(f"{path}: expected {name} to be {expected}, found {reprlib.repr(found)}")
 
 
 def _check_text(path: Path, text: str, name: str) -> None:
@@ -184,29 +193,8 @@ def _check_text(path: Path, text: str, name: str) -> None:
         raise RolloutError(f"{path}: expected {name} to be Unicode text, found {text[:20]!a}") from None
 
 
-def read_pose(path: Path) -> NDArray[np.float64]:
-    """A `(4, 4)` camera_to_world text file, checked to be rigid.
-
-    Raises:
-        RolloutError: it is missing, not 16 numbers, or not a rigid transform.
-    """
-    return read_poses([str(path)])[0]
-
-
-def read_poses(paths: Sequence[str]) -> NDArray[np.float64]:
-    """`(n, 4, 4)` camera_to_world of text files, checked to be rigid.
-
-    Raises:
-        RolloutError: one is missing, not 16 numbers, or not a rigid transform; the first such file is named.
-    """
-    poses = np.array([_pose_numbers(path) for path in paths]).reshape(-1, 4, 4)
-    for index in np.flatnonzero(~_clearly_rigid(poses)):
-        if fault := rigidity_fault(poses[index]):
-            raise RolloutError(f"{paths[index]}: not a rigid camera_to_world: {fault}")
-    return poses
-
-
-def _pose_numbers(path: str) -> list[float]:
+def _read_pose(path: str) -> NDArray[np.float64]:
+    """A `(4, 4)` camera_to_world text file, checked to be rigid."""
     try:
         with open(path, "rb", buffering=0) as file:
             numbers = [float(word) for word in file.read(_LONGEST_POSE_BYTES).split()]
@@ -218,18 +206,10 @@ def _pose_numbers(path: str) -> list[float]:
         raise RolloutError(f"{path}: expected 4 rows of 4 numbers, found {len(numbers)} numbers")
     if beyond := [number for number in numbers if abs(number) >= _BEYOND_ANY_SIZE]:
         raise RolloutError(f"{path}: expected metres, found {beyond[0]:g}")
-    return numbers
-
-
-def _clearly_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """`(n,)` whether each of `(n, 4, 4)` is beyond doubt; one call for thousands."""
-    rotations = poses[:, :3, :3]
-    with np.errstate(all="ignore"):
-        skew = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0)
-        last_row = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1, initial=0)
-        turned = np.linalg.det(rotations) > 0
-        finite = np.isfinite(poses).all(axis=(1, 2))
-    return finite & turned & (np.maximum(skew, last_row) < _CLEARLY_RIGID)
+    pose = np.array(numbers).reshape(4, 4)
+    if fault := rigidity_fault(pose):
+        raise RolloutError(f"{path}: not a rigid camera_to_world: {fault}")
+    return pose
 
 
 def _check_facts(path: Path, meta: dict[str, Any]) -> None:
@@ -238,19 +218,14 @@ def _check_facts(path: Path, meta: dict[str, Any]) -> None:
         value = meta.get(key)
         name = value.get("name") if isinstance(value, dict) else value
         if not isinstance(name, str | None):
-            raise RolloutError(f"{path}: expected the name of the {key} to be text, found {reprlib.repr(name)}")
+            raise _unlike(path, f"the name of the {key}", "text", name)
     for key in _OBJECTS:
         if not isinstance(meta.get(key, {}), dict):
-            raise RolloutError(f"{path}: expected {key} to be an object, found {reprlib.repr(meta[key])}")
+            raise _unlike(path, key, "an object", meta[key])
     for key in ("metrics", "actions"):
         for name, value in meta.get(key, {}).items():
-            if name != "names" and (isinstance(value, bool) or not isinstance(value, int | float)):
-                raise RolloutError(f"{path}: expected {key}.{name} to be a finite number, found {reprlib.repr(value)}")
-
-
-def _check_origin(path: Path, origin: Any) -> None:
-    if not (isinstance(origin, list) and len(origin) == 3 and all(map(_is_finite, origin))):
-        raise RolloutError(f"{path}: expected scene.origin to be three lengths in metres, found {reprlib.repr(origin)}")
+            if name != "names" and not _is_number(value):
+                raise _unlike(path, f"{key}.{name}", "a finite number", value)
 
 
 def _of(meta: dict[str, Any], key: str) -> dict[str, Any]:
@@ -261,9 +236,7 @@ def _of(meta: dict[str, Any], key: str) -> dict[str, Any]:
 def _count(folder: Path, meta: dict[str, Any], key: str) -> int:
     count = _of(meta, "counts").get(key)
     if not isinstance(count, int) or isinstance(count, bool) or count < 0:
-        raise RolloutError(
-            f"{folder / 'rollout.json'}: expected counts.{key} to be a whole number, found {reprlib.repr(count)}"
-        )
+        raise _unlike(folder / "rollout.json", f"counts.{key}", "a whole number", count)
     return count
 
 
@@ -272,15 +245,24 @@ def _intrinsics(path: Path, meta: dict[str, Any]) -> Intrinsics:
     values: dict[str, Any] = {}
     for name, kind in (("width", int), ("height", int), ("fx", float), ("fy", float), ("cx", float), ("cy", float)):
         value = camera.get(name)
-        if not _is_number_of_pixels(value) or (kind is int and value % 1):
-            expected = "a whole number of pixels" if kind is int else "a number of pixels"
-            raise RolloutError(f"{path}: expected camera.{name} to be {expected} above 0, found {reprlib.repr(value)}")
+        if not _is_size(value) or (kind is int and value % 1):
+            whole = "whole " if kind is int else ""
+            raise _unlike(path, f"camera.{name}", f"a {whole}number of pixels above 0", value)
         values[name] = kind(value)
     return Intrinsics(**values)
 
 
-def _is_number_of_pixels(value: Any) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < _BEYOND_ANY_SIZE
+def _is_number(value: Any) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_size(value: Any) -> TypeGuard[float]:
+    return _is_number(value) and 0 < value < _BEYOND_ANY_SIZE
+
+
+def _are_lengths(value: Any, count: int) -> TypeGuard[list[float]]:
+    numbers = isinstance(value, list) and len(value) == count and all(map(_is_number, value))
+    return numbers and all(abs(number) < _BEYOND_ANY_SIZE for number in value)
 
 
 def _read_views(root: Path, base: Path, count: int, intrinsics: Intrinsics) -> list[View]:
@@ -289,13 +271,12 @@ def _read_views(root: Path, base: Path, count: int, intrinsics: Intrinsics) -> l
     for kind, suffix in (("images", ".png"), ("depth", ".png"), ("poses", ".txt")):
         _check_listing(root, base / kind, suffix, count)
     stems = [frame_name(index) for index in range(count)]
-    poses = read_poses([f"{base}/poses/{stem}.txt" for stem in stems])
+    poses = [_read_pose(f"{base}/poses/{stem}.txt") for stem in stems]
     size = {"width": intrinsics.width, "height": intrinsics.height}
     for stem in stems:
         check_png_structure(f"{base}/images/{stem}.png", **size, kind=RGB_8)
         check_png_structure(f"{base}/depth/{stem}.png", **size, kind=GREY_16)
-    images, depths = base / "images", base / "depth"
-    return [View(images / f"{stem}.png", depths / f"{stem}.png", pose) for stem, pose in zip(stems, poses, strict=True)]
+    return [view_of(base, index, pose) for index, pose in enumerate(poses)]
 
 
 def _read_floor(folder: Path, meta: dict[str, Any]) -> Floor | None:
@@ -304,26 +285,19 @@ def _read_floor(folder: Path, meta: dict[str, Any]) -> Floor | None:
     entry, about = _of(meta, "floor"), folder / "rollout.json"
     name, shape, origin, cell = (entry.get(key) for key in ("file", "shape", "origin_m", "cell_m"))
     if not isinstance(name, str) or not name:
-        raise RolloutError(f"{about}: expected floor.file to be the name of a file, found {name!r}")
-    if not _is_pair(shape) or not all(isinstance(side, int) and _is_number_of_pixels(side) for side in shape):
-        raise RolloutError(f"{about}: expected floor.shape to be rows and columns above 0, found {shape!r}")
-    if not _is_pair(origin) or not all(map(_is_finite, origin)):
-        raise RolloutError(f"{about}: expected floor.origin_m to be x and z in metres, found {origin!r}")
-    if not _is_finite(cell) or cell <= 0:
-        raise RolloutError(f"{about}: expected floor.cell_m to be metres above 0, found {cell!r}")
+        raise _unlike(about, "floor.file", "the name of a file", name)
+    if not _are_lengths(shape, 2) or not all(isinstance(side, int) and side > 0 for side in shape):
+        raise _unlike(about, "floor.shape", "rows and columns above 0", shape)
+    if not _are_lengths(origin, 2):
+        raise _unlike(about, "floor.origin_m", "x and z in metres", origin)
+    if not _is_size(cell):
+        raise _unlike(about, "floor.cell_m", "metres above 0", cell)
     picture = folder / name
     _check_inside(folder, picture)
-    check_png_structure(str(picture), width=shape[1], height=shape[0], kind=GREY_16)
+    rows, columns = (int(side) for side in shape)
+    check_png_structure(str(picture), width=columns, height=rows, kind=GREY_16)
     check_png_contents(picture)
-    return Floor(picture, float(cell), (float(origin[0]), float(origin[1])), (shape[0], shape[1]))
-
-
-def _is_pair(value: Any) -> TypeGuard[list[Any]]:
-    return isinstance(value, list) and len(value) == 2
-
-
-def _is_finite(value: Any) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(abs(value) < _BEYOND_ANY_SIZE)
+    return Floor(picture, float(cell), (float(origin[0]), float(origin[1])), (rows, columns))
 
 
 def _check_listing(root: Path, folder: Path, suffix: str, count: int) -> None:
@@ -331,9 +305,8 @@ def _check_listing(root: Path, folder: Path, suffix: str, count: int) -> None:
     _check_inside(root, folder)
     try:
         with os.scandir(folder) as entries:
-            plain = {
-                entry.name: entry.is_file(follow_symlinks=False) for entry in entries if entry.name.endswith(suffix)
-            }
+            found = [entry for entry in entries if entry.name.endswith(suffix)]
+            plain = {entry.name: entry.is_file(follow_symlinks=False) for entry in found}
     except OSError as error:
         raise RolloutError(f"{folder}: expected {count} files, could not list it: {error.strerror}") from None
     # The count may be anything: the search ends at the first name that is not there.

@@ -5,6 +5,8 @@ import json
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -13,22 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.errors import RolloutError
-from avp_habitat.files import NewFolder
+from avp_habitat.files import atomic_folder, check_new
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout import images
-from avp_habitat.rollout.format import FORMAT, FORMAT_VERSION, HELDOUT, POSE_CONVENTION, View, frame_name
+from avp_habitat.rollout.format import FORMAT, FORMAT_VERSION, HELDOUT, POSE_CONVENTION, View, frame_name, view_of
 
+_FOLDERS = [f"{base}/{kind}".lstrip("/") for base in ("", HELDOUT) for kind in ("images", "depth", "poses")]
 _THREADS = 4
 _AHEAD = 8
 """At most so many pictures wait to be encoded and written, which bounds the memory."""
 
 
 class RolloutWriter:
-    """A context in which frames are written to a temporary folder, renamed to its final name by `publish`.
+    """A context that fills a folder, which appears when `publish` is called, and only then.
 
     Views are encoded in threads while the next are rendered: their arrays must not change once they were added, and a
     disk that fails is reported by one of the next calls, by `publish` at the latest.
-    Leaving the context without `publish` (an error, Ctrl-C) removes the temporary folder.
     """
 
     def __init__(self, folder: str | Path, intrinsics: Intrinsics) -> None:
@@ -42,9 +44,11 @@ class RolloutWriter:
             UsageError: the folder exists.
             RolloutError: its parent cannot be written.
         """
+        self.folder = Path(folder)
         self.intrinsics = intrinsics
-        self._new = NewFolder(folder, failure=RolloutError)
-        self.folder = self._new.folder
+        check_new(self.folder, option="--out")
+        self._context = ExitStack()
+        self._partial = self.folder
         self._poses: dict[str, list[NDArray[np.float64]]] = {"": [], HELDOUT: []}
         self._steps: list[dict[str, Any]] = []
         self._threads = ThreadPoolExecutor(_THREADS)
@@ -52,13 +56,12 @@ class RolloutWriter:
 
     def __enter__(self) -> "RolloutWriter":
         """Make the temporary folder."""
-        self._new.__enter__()
+        self._partial = self._context.enter_context(atomic_folder(self.folder, failure=RolloutError, option="--out"))
         try:
-            for base in ("", HELDOUT):
-                for kind in ("images", "depth", "poses"):
-                    (self.path(base) / kind).mkdir(parents=True)
+            for kind in _FOLDERS:
+                self.path(kind).mkdir(parents=True)
         except OSError as error:
-            self._new.__exit__(type(error), error, None)
+            self._context.__exit__(type(error), error, error.__traceback__)
         return self
 
     def __exit__(
@@ -66,7 +69,9 @@ class RolloutWriter:
     ) -> None:
         """Remove what was not published; report a full or failing disk as such."""
         self._threads.shutdown(cancel_futures=True)
-        self._new.__exit__(kind, error, trace)
+        # What ends without an error, but was not published, is abandoned, as a generator is that is closed.
+        error = error or GeneratorExit()
+        self._context.__exit__(type(error), error, trace)
 
     def add_frame(self, rgb: NDArray[np.uint8], depth: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
         """Write the next captured frame: `(h, w, 3)` uint8, `(h, w)` metres, `(4, 4)` habitat camera_to_world."""
@@ -84,13 +89,11 @@ class RolloutWriter:
         """The captured frames, or the held-out views, so far; all of them are written."""
         self._finish(waiting=0)
         base = HELDOUT if heldout else ""
-        images, depths = self.path(base) / "images", self.path(base) / "depth"
-        names = [f"{frame_name(index)}.png" for index in range(len(self._poses[base]))]
-        return [View(images / n, depths / n, pose) for n, pose in zip(names, self._poses[base], strict=True)]
+        return [view_of(self.path(base), index, pose) for index, pose in enumerate(self._poses[base])]
 
     def path(self, name: str) -> Path:
         """Where to write a further file of the folder."""
-        return self._new.path(name)
+        return self._partial / name
 
     def publish(self, meta: Mapping[str, Any]) -> Path:
         """Write the tables, then give the folder its final name.
@@ -105,7 +108,8 @@ class RolloutWriter:
         self._write_steps()
         self._write_json("transforms.json", self._transforms())
         self._write_json("rollout.json", self._rollout(meta))
-        return self._new.publish()
+        self._context.close()
+        return self.folder
 
     def _add(self, base: str, rgb: NDArray[np.uint8], depth: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
         folder, stem = self.path(base), frame_name(len(self._poses[base]))
@@ -122,14 +126,6 @@ class RolloutWriter:
             self._pending.popleft().result()
 
     def _rollout(self, meta: Mapping[str, Any]) -> dict[str, Any]:
-        camera = {
-            "width": self.intrinsics.width,
-            "height": self.intrinsics.height,
-            "fx": self.intrinsics.fx,
-            "fy": self.intrinsics.fy,
-            "cx": self.intrinsics.cx,
-            "cy": self.intrinsics.cy,
-        }
         return {
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
@@ -137,23 +133,18 @@ class RolloutWriter:
             "counts": {"frames": len(self._poses[""]), HELDOUT: len(self._poses[HELDOUT])},
             "depth": {"unit": "millimetre", "kind": "planar z-depth", "none": 0},
             **meta,
-            "camera": camera | dict(meta.get("camera", {})),
+            "camera": asdict(self.intrinsics) | dict(meta.get("camera", {})),
         }
 
     def _transforms(self) -> dict[str, Any]:
-        names = {
-            base: [f"{base}/images/{frame_name(i)}.png".lstrip("/") for i in range(len(poses))]
-            for base, poses in self._poses.items()
-        }
-        frames = [
-            {
-                "file_path": name,
-                "depth_file_path": name.replace("images/", "depth/"),
-                "transform_matrix": pose.tolist(),
-            }
-            for base, poses in self._poses.items()
-            for name, pose in zip(names[base], poses, strict=True)
-        ]
+        names: dict[str, list[str]] = {"": [], HELDOUT: []}
+        frames = []
+        for base, poses in self._poses.items():
+            for index, pose in enumerate(poses):
+                view = view_of(Path(base), index, pose)
+                names[base].append(view.image.as_posix())
+                files = {"file_path": view.image.as_posix(), "depth_file_path": view.depth.as_posix()}
+                frames.append({**files, "transform_matrix": pose.tolist()})
         camera = self.intrinsics
         return {
             "camera_model": "OPENCV",

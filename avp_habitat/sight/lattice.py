@@ -81,7 +81,7 @@ class Lattice:
         return grid[self._near_floor()[grid[:, 0], grid[:, 1]]]
 
     def _near_floor(self) -> NDArray[np.bool_]:
-        """Which lattice points have the centre of a navigable cell less than a spacing and a cell away, each way."""
+        """`shape` which points have the centre of a navigable cell less than a spacing and a cell away, each way."""
         near = np.zeros(self.shape, dtype=np.bool_)
         row, column = np.nonzero(self.area.mask)
         at = (np.stack([column, row], axis=1) + 0.5) * self.area.cell_m

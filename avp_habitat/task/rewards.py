@@ -159,7 +159,8 @@ REWARDS: dict[str, RewardFunction] = {
     "surface": surface,
 }
 """What is built in, by name."""
-REWARD_NAMES = tuple(REWARDS)
+REWARDS_HELP = f"{', '.join(REWARDS)} or MODULE:FUNCTION"
+"""Help of the option `--reward`."""
 
 
 def find_reward(reward: str | RewardFunction) -> RewardFunction:
@@ -215,21 +216,21 @@ def reward_parts(
         got = "none" if isinstance(parts, Mapping) else type(parts).__name__
         raise UsageError(f"reward {plugins.name_of(reward)}: expected parts by name, as {{'new': …}}, got {got}")
     agents = len(facts.coverage)
-    # The name is put together for an error only: this is done for every step.
     return {name: _for_each(agents, value, reward, name) for name, value in parts.items()}
 
 
 def _for_each(agents: int, value: Number | float, reward: RewardFunction, part: str) -> NDArray[np.float64]:
-    expected, got = None, repr(value)
     try:
         numbers = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
-        numbers, expected = np.zeros(()), "numbers"
+        raise _wrong_part(reward, part, "numbers", repr(value)) from None
     if not np.isfinite(numbers).all():
-        expected = "finite numbers"
-    elif numbers.shape not in ((), (agents,)):
-        expected, got = f"one number for each of {agents} agents", f"shape {numbers.shape}"
-    if expected is not None:
-        text = f"reward {plugins.name_of(reward)}: part {part!r}: expected {expected}, got {' '.join(got.split())}"
-        raise UsageError(text)
+        raise _wrong_part(reward, part, "finite numbers", repr(value))
+    if numbers.shape not in ((), (agents,)):
+        raise _wrong_part(reward, part, f"one number for each of {agents} agents", f"shape {numbers.shape}")
     return np.full(agents, numbers) if numbers.ndim == 0 else numbers
+
+
+def _wrong_part(reward: RewardFunction, part: str, expected: str, got: str) -> UsageError:
+    words = " ".join(got.split())
+    return UsageError(f"reward {plugins.name_of(reward)}: part {part!r}: expected {expected}, got {words}")

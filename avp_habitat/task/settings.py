@@ -19,7 +19,8 @@ OBSERVATIONS = {
     "surface_map": "avp_habitat.task.observations:SurfaceMap",
 }
 """The kinds that are built in, by name."""
-OBSERVATION_NAMES = tuple(OBSERVATIONS)
+OBSERVATIONS_HELP = f"{', '.join(OBSERVATIONS)} or MODULE:OBJECT"
+"""Help of the option `--observation`."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from tyro.conf import UseAppendAction, arg
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
-from avp_habitat.files import NewFolder
+from avp_habitat.files import atomic_folder, check_new
 from avp_habitat.metrics import (
     FIGURES,
     METRICS_HELP,
@@ -28,18 +28,8 @@ from avp_habitat.metrics import (
     mean_and_half_width,
 )
 from avp_habitat.tables import table
+from avp_habitat.tracking import names
 from avp_habitat.tracking.experiments import DEFAULT_HELP, chosen_experiment, find_experiment
-from avp_habitat.tracking.names import (
-    COMPARISON,
-    EVALUATION,
-    KIND_TAG,
-    MAX_TAG,
-    METHOD_TAG,
-    NOTE_TAG,
-    POLICY_TAG,
-    ROLLOUT_RUN_TAG,
-    SCENE_TAG,
-)
 from avp_habitat.tracking.stores import (
     ADDRESS_HELP,
     DEFAULT_ADDRESS,
@@ -71,17 +61,15 @@ class Method:
     """One row: the runs of a policy in a scene, by one method."""
 
     policy: str
-    """Who took the views."""
     scene: str
-    """Where."""
     method: str
-    """nerfstudio's method, or `evaluation`."""
     runs: int
-    """How many."""
     means: Mapping[str, float]
     """By name of the figure; what no run has is missing."""
     halves: Mapping[str, float]
     """Half of the 95 % interval, where more than one run or episode tells of the spread."""
+    further: tuple[Figure, ...] = ()
+    """A user's metrics among them."""
 
     def cells(self, shown: Sequence[Figure]) -> list[str]:
         """The row, with these figures."""
@@ -92,34 +80,38 @@ class Method:
         return [self.policy, self.scene, self.method, str(self.runs), *texts]
 
 
-def compare(client: "MlflowClient", experiment_id: str) -> list[Method]:
+def compare(client: "MlflowClient", experiment_id: str, metrics: Sequence[str] = ()) -> list[Method]:
     """What an experiment's reconstructions, rollouts and evaluations (of its first 50,000 runs) say of each method.
 
     Args:
         client: of the store.
         experiment_id: where to look.
+        metrics: of the user, for those that no distribution registers.
 
     Returns:
         Rows by scene; within it those with a reconstruction first, the best PSNR at the top, then by coverage.
     """
+    known = figures(metrics)
     found = client.search_runs([experiment_id], "metrics.`eval/coverage` >= 0", max_results=_MOST_RUNS)
     # A reconstruction carries the figures of its rollout, which would otherwise count twice.
-    rollouts = {run.data.tags.get(ROLLOUT_RUN_TAG) for run in found}
+    rollouts = {run.data.tags.get(names.ROLLOUT_RUN_TAG) for run in found}
     groups: dict[tuple[str, str, str], list[dict[str, float]]] = defaultdict(list)
     for run in found:
-        metrics = {name: value for name, value in run.data.metrics.items() if math.isfinite(value)}
+        logged = {name: value for name, value in run.data.metrics.items() if math.isfinite(value)}
         tags = run.data.tags
         # A run without a policy is that of a training with evaluations in between.
-        told = tags.get(POLICY_TAG) and {"eval/coverage", "eval/views"} <= metrics.keys()
-        if told and tags.get(KIND_TAG) != COMPARISON and run.info.run_id not in rollouts:
-            method = tags.get(METHOD_TAG) or tags.get(KIND_TAG) or EVALUATION
-            groups[tags[POLICY_TAG], tags.get(SCENE_TAG, "?"), method].append(metrics)
-    return sorted((_method(*key, group) for key, group in groups.items()), key=_rank)
+        told = tags.get(names.POLICY_TAG) and {"eval/coverage", "eval/views"} <= logged.keys()
+        if told and tags.get(names.KIND_TAG) != names.COMPARISON and run.info.run_id not in rollouts:
+            method = tags.get(names.METHOD_TAG) or tags.get(names.KIND_TAG) or names.EVALUATION
+            groups[tags[names.POLICY_TAG], tags.get(names.SCENE_TAG, "?"), method].append(logged)
+    return sorted((_method(*key, group, known) for key, group in groups.items()), key=_rank)
 
 
-def _method(policy: str, scene: str, method: str, runs: Sequence[Mapping[str, float]]) -> Method:
+def _method(
+    policy: str, scene: str, method: str, runs: Sequence[Mapping[str, float]], known: Mapping[str, Figure]
+) -> Method:
     means, halves = {}, {}
-    for name in [figure.name for figure in _ALWAYS] + [name for name in figures() if name not in FIGURES]:
+    for name in [figure.name for figure in _ALWAYS] + [name for name in known if name not in FIGURES]:
         values = [run[f"eval/{name}"] for run in runs if f"eval/{name}" in run]
         if values:
             mean, half = mean_and_half_width(values)
@@ -128,7 +120,8 @@ def _method(policy: str, scene: str, method: str, runs: Sequence[Mapping[str, fl
             halves[name] = float(half) if len(values) > 1 else runs[0].get(f"eval/{name}_ci95", math.nan)
     coverages, views = ([run[name] for run in runs] for name in ("eval/coverage", "eval/views"))
     means["cpv"] = coverage_per_view(coverages, views)  # type: ignore[arg-type]
-    return Method(policy, scene, method, len(runs), means, {**halves, "cpv": math.nan})
+    further = tuple(figure for name, figure in known.items() if name not in FIGURES and name in means)
+    return Method(policy, scene, method, len(runs), means, {**halves, "cpv": math.nan}, further)
 
 
 def _rank(method: Method) -> tuple[Any, ...]:
@@ -138,8 +131,7 @@ def _rank(method: Method) -> tuple[Any, ...]:
 
 def rows(methods: Sequence[Method]) -> tuple[list[str], list[list[str]]]:
     """Head and rows of the table; a user's metric has a column where a run has it."""
-    further = [figure for name, figure in figures().items() if name not in FIGURES]
-    shown = [*_ALWAYS, *(one for one in further if any(one.name in method.means for method in methods))]
+    shown = list(dict.fromkeys([*_ALWAYS, *(figure for method in methods for figure in method.further)]))
     head = ["policy", "scene", "method", "runs", *(figure.heading for figure in shown)]
     return head, [method.cells(shown) for method in methods]
 
@@ -177,23 +169,18 @@ def picture(methods: Sequence[Method], path: Path) -> bool:
 
 
 def keep(client: "MlflowClient", experiment_id: str, methods: Sequence[Method]) -> str:
-    """Make or renew the run that compares these methods; there is one for each set of scenes.
-
-    Args:
-        client: of the store.
-        experiment_id: where the run lies.
-        methods: at least one.
+    """Make or renew the run that compares these methods, one for each set of scenes; its id.
 
     Raises:
         MlflowException: the store refuses.
-
-    Returns:
-        The run's id.
     """
-    tags = {KIND_TAG: COMPARISON, SCENE_TAG: ", ".join(sorted({method.scene for method in methods}))[:MAX_TAG]}
-    of_kind = client.search_runs([experiment_id], f"tags.`{KIND_TAG}` = '{COMPARISON}'")
-    kept = [run for run in of_kind if run.data.tags.get(SCENE_TAG) == tags[SCENE_TAG]]
-    run = kept[0] if kept else client.create_run(experiment_id, run_name=COMPARISON, tags=tags)
+    tags = {
+        names.KIND_TAG: names.COMPARISON,
+        names.SCENE_TAG: ", ".join(sorted({method.scene for method in methods}))[: names.MAX_TAG],
+    }
+    of_kind = client.search_runs([experiment_id], f"tags.`{names.KIND_TAG}` = '{names.COMPARISON}'")
+    kept = [run for run in of_kind if run.data.tags.get(names.SCENE_TAG) == tags[names.SCENE_TAG]]
+    run = kept[0] if kept else client.create_run(experiment_id, run_name=names.COMPARISON, tags=tags)
     run_id = run.info.run_id
     try:
         client.log_dict(run_id, dict(zip(("columns", "data"), rows(methods), strict=True)), TABLE)
@@ -204,7 +191,7 @@ def keep(client: "MlflowClient", experiment_id: str, methods: Sequence[Method]) 
             for path in Path(folder).iterdir():
                 client.log_artifact(run_id, os.fspath(path))
         # The page shows it above everything else.
-        client.set_tag(run_id, NOTE_TAG, (markdown(methods) + _HOW_TO_READ)[:MAX_TAG])
+        client.set_tag(run_id, names.NOTE_TAG, (markdown(methods) + _HOW_TO_READ)[: names.MAX_TAG])
     finally:
         client.set_terminated(run_id)
     return run_id
@@ -242,7 +229,8 @@ def main(options: Compare) -> None:
     from mlflow.exceptions import MlflowException
 
     address = str(address_of(options.mlflow, default=DEFAULT_ADDRESS))
-    folder = None if options.out is None else NewFolder(options.out, failure=UsageError)
+    if options.out is not None:
+        check_new(options.out, option="--out")
     client = connect(address)
     try:
         experiment = _experiment(client, options.experiment)
@@ -252,10 +240,10 @@ def main(options: Compare) -> None:
         prepare_experiment(client, experiment.experiment_id)
     except MlflowException as error:
         raise TrackingError(f"MLflow at {shown(address)} does not answer: {first_line(error)}") from None
-    if folder is not None:
-        with folder:
-            _write(folder.path("."), methods)
-            print(f"files:   {folder.publish()}")
+    if options.out is not None:
+        with atomic_folder(options.out, failure=UsageError, option="--out") as folder:
+            _write(folder, methods)
+        print(f"files:   {options.out}")
     page = f"#/experiments/{experiment.experiment_id}/runs/{run}?{MODEL_TRAINING}"
     served = urlsplit(address).scheme in ("http", "https")
     there = f"{how_to_look(address).rstrip('/')}/" if served else f"{how_to_look(address)}, then http://127.0.0.1:5000/"
@@ -273,7 +261,7 @@ def _experiment(client: "MlflowClient", option: str | None) -> "Experiment":
 
 
 def _methods(client: "MlflowClient", experiment: "Experiment", options: Compare) -> list[Method]:
-    methods = compare(client, experiment.experiment_id)
+    methods = compare(client, experiment.experiment_id, options.metrics)
     if not methods:
         raise AVPError(
             f"experiment {experiment.name!r} at {shown(client.tracking_uri)} has no run with eval/coverage, eval/views "

@@ -3,39 +3,20 @@
 import logging
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
-
-from tyro.conf import arg
 
 from avp_habitat import command
 from avp_habitat.errors import UsageError
-from avp_habitat.tracking.journal import SPOOL_VARIABLE, Journal, headers, spool_folder
+from avp_habitat.tracking.journal import Journal, headers, spool_folder
 from avp_habitat.tracking.run import TrackedRun
 from avp_habitat.tracking.stores import TrackingError, absolute, shown
 
 # Somebody waits for the command, and a server that has just been started takes long over its first answers.
 _PATIENCE_S = 120.0
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Recovered:
-    """What became of one journal."""
-
-    run_id: str
-    """MLflow's, or the one given offline."""
-    address: str
-    """Of its store."""
-    status: str
-    """The run's."""
-    delivered: bool
-    """Whether MLflow has everything; the journal is gone then."""
-    killed: bool
-    """Whether the run was left open by a process that was killed, and is now closed."""
 
 
 def left_journals(spool: Path) -> Iterator[Journal]:
@@ -45,51 +26,45 @@ def left_journals(spool: Path) -> Iterator[Journal]:
             yield journal
 
 
-def finish(journal: Journal, *, again: bool = False, timeout_s: float = 30.0) -> Recovered:
-    """Send what a journal holds and close its run, as KILLED when its process did not.
+def finish(journal: Journal, *, again: bool = False, timeout_s: float = 30.0) -> tuple[bool, str]:
+    """Send what a left journal holds, `again` also what MLflow refused, and close its run, if need be as KILLED.
 
-    Args:
-        journal: nobody's.
-        again: try also what MLflow refused.
-        timeout_s: to wait for a store at most without any progress.
+    Returns:
+        Whether MLflow has everything, so that the journal is gone; and a line that says so.
     """
-    header = journal.header
-    killed, last_ms = header["ended"] is None, journal.last_written_ms()
+    header, last_ms = journal.header, journal.last_written_ms()
+    killed = header["ended"] is None
     if again:
         journal.restore_rejected()
     run = TrackedRun(journal, None, uncertain=True, interval_s=0.0)
-    ended = run.close("KILLED", at_ms=last_ms, timeout_s=timeout_s) if killed else run.leave(timeout_s=timeout_s)
-    return Recovered(run.run_id, run.address, header["ended"], ended, killed and header["owned"])
+    delivered = run.close("KILLED" if killed else None, at_ms=last_ms, timeout_s=timeout_s)
+    how = f"{header['ended']}{', its program was killed' if killed and header['owned'] else ''}"
+    return delivered, f"run {run.run_id} at {shown(run.address)}: {'sent' if delivered else 'NOT sent'} ({how})"
 
 
-def recover(spool: Path, *, timeout_s: float = 30.0, on_each: Callable[[Recovered], object] = lambda _: None) -> None:
-    """Finish all journals that killed processes left in a folder."""
-    for journal in left_journals(spool):
+def recover(*, timeout_s: float = 30.0) -> Iterator[str]:
+    """Finish all journals that killed processes left in the spool folder; a line on each."""
+    for journal in left_journals(spool_folder()):
         ended, made = journal.header["ended"] is not None, journal.header["run_id"] is not None
         if journal.pending or (made and not ended):
-            on_each(finish(journal, timeout_s=timeout_s))
+            yield finish(journal, timeout_s=timeout_s)[1]
         elif journal.has_rejected:
             journal.release()  # It waits for somebody who looks at it.
         else:
             journal.remove()
 
 
-def recover_in_background(spool: Path) -> threading.Thread:
+def recover_in_background() -> threading.Thread:
     """`recover` without making anybody wait for a slow server; a warning names each run."""
 
     def work() -> None:
         with suppress(OSError):
-            recover(spool, timeout_s=10.0, on_each=_warn)
+            for line in recover(timeout_s=10.0):
+                _log.warning("MLflow: what an earlier program left, %s", line)
 
     thread = threading.Thread(target=work, name="avp-mlflow-recovery", daemon=True)
     thread.start()
     return thread
-
-
-def _warn(result: Recovered) -> None:
-    done = "closed as KILLED" if result.killed else "completed"
-    state = done if result.delivered else "still not sent"
-    _log.warning("MLflow run %s of an earlier program, at %s: %s", result.run_id, shown(result.address), state)
 
 
 @dataclass(frozen=True)
@@ -99,9 +74,8 @@ class Deliver:
     Runs whose program was killed are closed. Each point arrives once, however often this is run.
     """
 
-    spool: Annotated[Path | None, arg(help=f"Where they wait (omitted: {SPOOL_VARIABLE}, else runs/mlflow-spool).")] = (
-        None
-    )
+    spool: Path | None = None
+    """Where they wait (omitted: AVP_MLFLOW_SPOOL, else runs/mlflow-spool)."""
     mlflow: str | None = None
     """Send them to this address instead of where they were meant for."""
     again: bool = False
@@ -131,13 +105,11 @@ def _deliver(spool: Path, count: int, options: Deliver) -> None:
         if options.mlflow is not None:
             journal.header["address"] = absolute(options.mlflow)
         done.append(finish(journal, again=options.again, timeout_s=_PATIENCE_S))
-    for result in done:
-        killed = ", its program was killed" if result.killed else ""
-        sent = "sent" if result.delivered else "NOT sent"
-        print(f"run {result.run_id} at {shown(result.address)}: {sent} ({result.status}{killed})")
+    for _, line in done:
+        print(line)
     if busy := count - len(done):
         print(f"{busy} of {count} belong to programs that still run")
-    if failed := sum(not result.delivered for result in done):
+    if failed := sum(not delivered for delivered, _ in done):
         raise TrackingError(f"{failed} of {count} runs could not be sent; they stay in {spool}")
 
 

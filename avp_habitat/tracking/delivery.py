@@ -19,15 +19,7 @@ from typing import TYPE_CHECKING, Any
 from avp_habitat.tracking.experiments import create_run
 from avp_habitat.tracking.journal import Journal
 from avp_habitat.tracking.names import CHANGED_TAG, MAX_TAG
-from avp_habitat.tracking.stores import (
-    StoreUnreachableError,
-    TrackingError,
-    connect,
-    first_line,
-    is_missing,
-    shown,
-    unreachable,
-)
+from avp_habitat.tracking.stores import StoreUnreachableError, connect, first_line, shown, unreachable
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -37,17 +29,11 @@ INTERVAL_S = 5.0
 _RETRY_S = (1.0, 15.0)
 _ASKED_AGAIN, _FAILED_AGAIN = 2, 8
 _PER_CALL = {"metrics": 900, "params": 100, "tags": 100}
-_PERMANENT = {
-    "BAD_REQUEST",
-    "ENDPOINT_NOT_FOUND",
-    "INVALID_PARAMETER_VALUE",
-    "INVALID_STATE",
-    "MALFORMED_REQUEST",
-    "NOT_IMPLEMENTED",
-    "PERMISSION_DENIED",
-    "RESOURCE_ALREADY_EXISTS",
-    "RESOURCE_DOES_NOT_EXIST",
-}
+_PERMANENT = (
+    "BAD_REQUEST ENDPOINT_NOT_FOUND INVALID_PARAMETER_VALUE INVALID_STATE MALFORMED_REQUEST NOT_IMPLEMENTED "
+    "PERMISSION_DENIED RESOURCE_ALREADY_EXISTS RESOURCE_DOES_NOT_EXIST"
+)
+"""MLflow's errors that trying again does not cure."""
 _THREAD = "avp-mlflow"
 _log = logging.getLogger(__name__)
 
@@ -56,15 +42,16 @@ class Sender:
     """Sends one journal's entries until it is stopped."""
 
     def __init__(
-        self, journal: Journal, client: "MlflowClient | None", *, uncertain: bool, interval_s: float = INTERVAL_S
+        self,
+        journal: Journal,
+        client: "MlflowClient | None" = None,
+        *,
+        uncertain: bool = False,
+        interval_s: float = INTERVAL_S,
     ) -> None:
-        """Begin.
+        """Begin to send what is in `journal`, each `interval_s`; `uncertain`: an earlier process may have sent some.
 
-        Args:
-            journal: to empty; its run is made when it does not exist yet.
-            client: of its store; None connects when something is to be sent.
-            uncertain: whether the first entries may have been sent by an earlier process.
-            interval_s: between two calls.
+        A client of the store is made when something is to be sent, where none is given.
         """
         self._journal = journal
         self._client: Any = client
@@ -92,8 +79,7 @@ class Sender:
     def drain(self, timeout_s: float) -> bool:
         """Send everything without waiting for the interval; whether MLflow has it.
 
-        Args:
-            timeout_s: to wait at most without any progress; a server that is gone is asked twice more instead.
+        It waits at most so long without any progress; a server that is gone is asked twice more instead.
         """
         unanswered, failures = self._unanswered + _ASKED_AGAIN, self._failures + _FAILED_AGAIN
         answers, until = self._answers, time.monotonic() + timeout_s
@@ -142,11 +128,8 @@ class Sender:
         self._failures += 1
         self._unanswered += isinstance(error, StoreUnreachableError)
         if self.problem is None:
-            kept = "" if self._journal.folder is None else f" in {self._journal.folder}"
-            _log.warning(
-                "MLflow at %s does not take the run's points now (%s); they are kept%s and sent when it does",
-                *(shown(self._journal.header["address"]), first_line(error), kept),
-            )
+            text = "MLflow at %s does not take the run's points now (%s); they are kept in %s and sent when it does"
+            _log.warning(text, shown(self._journal.header["address"]), first_line(error), self._journal.folder)
         self.problem = first_line(error)
 
     def _send_some(self) -> None:
@@ -166,9 +149,7 @@ class Sender:
         """Connect; make the run, or open it again, as the journal's header asks."""
         header = self._journal.header
         if self._client is None:
-            if header["run_id"] is not None and is_missing(header["address"]):
-                raise StoreUnreachableError("the database is gone")
-            self._client = connect(header["address"])
+            self._client = connect(header["address"], make=header["run_id"] is None)
         if header["run_id"] is None:
             self._journal.update({"run_id": create_run(self._client, header)})
         elif header.get("continue"):
@@ -180,9 +161,12 @@ class Sender:
         self._send_values(entries)
         # Of files that replace each other the last one is enough. A run ends after everything else.
         files = {entry["path"]: entry for entry in entries if "file" in entry}
-        others = [entry for entry in entries if not entry.keys() & {*_PER_CALL, "file"}]
-        for entry in [*files.values(), *others]:
-            self._call(entry, partial(self._send_file if "file" in entry else self._end, entry))
+        for entry in files.values():
+            self._call(entry, partial(self._send_file, entry))
+        for entry in entries:
+            if "end" in entry:
+                how = (self._run_id, entry["end"], entry["at"])
+                self._call(entry, partial(self._client.set_terminated, *how))
 
     def _send_values(self, entries: Sequence[Mapping[str, Any]]) -> None:
         from mlflow.entities import Metric, Param, RunTag
@@ -227,19 +211,14 @@ class Sender:
         if (source := self._file_of(entry)).is_file():
             self._client.log_artifact(self._run_id, str(source), None if folder == "." else folder)
 
-    def _end(self, entry: Mapping[str, Any]) -> None:
-        if "end" not in entry:
-            raise TrackingError("nobody can read this line")
-        self._client.set_terminated(self._run_id, entry["end"], entry["at"])
-
     def _call(self, entry: Mapping[str, Any], call: Callable[[], object]) -> None:
         """Call MLflow; an entry that it refuses for good is kept as rejected."""
         from mlflow.exceptions import MlflowException
 
         try:
             call()
-        except (MlflowException, TrackingError) as error:
-            if isinstance(error, MlflowException) and error.error_code not in _PERMANENT:
+        except MlflowException as error:
+            if error.error_code not in _PERMANENT.split():
                 raise
             reason = first_line(error)
             self._journal.reject(entry, reason)
@@ -247,7 +226,7 @@ class Sender:
         self._answers += 1
 
     def _file_of(self, entry: Mapping[str, Any]) -> Path:
-        return Path(self._journal.folder or "") / entry["file"]
+        return self._journal.folder / entry["file"]
 
 
 def _is_not_ours(record: logging.LogRecord) -> bool:

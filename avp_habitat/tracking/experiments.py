@@ -19,10 +19,9 @@ _NOT_THERE = ("RESOURCE_DOES_NOT_EXIST", "INVALID_PARAMETER_VALUE")
 
 
 def chosen_experiment(option: str | None) -> tuple[str | None, str | None]:
-    """The name or the id of the experiment that runs go to; one of them is None.
+    """The name, or else the id, of the experiment that runs go to.
 
-    Args:
-        option: a name; when omitted, what MLflow's variables say, which `mlflow.set_experiment` sets too, else `avp`.
+    The option, else what MLflow's variables say, which `mlflow.set_experiment` sets too, else `avp`.
     """
     if option:
         return option, None
@@ -59,12 +58,7 @@ def find_experiment(client: "MlflowClient", name: str | None, identity: str | No
 
 
 def experiment_id(client: "MlflowClient", name: str | None, identity: str | None = None) -> str:
-    """The id of an experiment, which is made, with its views, when it does not exist.
-
-    Args:
-        client: of the store.
-        name: of the experiment.
-        identity: its id, where there is no name.
+    """The id of the experiment of a name or an id, which is made, with its views, when there is none of that name.
 
     Raises:
         TrackingError: as `find_experiment`.
@@ -122,13 +116,8 @@ def search_tags(client: "MlflowClient", tags: Mapping[str, str], home: str | Non
 
 
 def create_run(client: "MlflowClient", header: Mapping[str, Any]) -> str:
-    """The id of a journal's run, which is made when the store has none for its key.
-
-    Args:
-        client: of the store.
-        header: of the journal: `key`, `experiment`, `experiment_id`, `name`, `tags`, `parent` and `started_ms`.
-    """
-    earlier = find_run(client, f"{OFFLINE}{header['key']}") if header.get("creating") else None
+    """The id of the run of a journal with this header, which is made when the store has none for its key."""
+    earlier = find_run(client, f"{OFFLINE}{header['key']}")
     if earlier is not None:
         return earlier.info.run_id
     identity = experiment_id(client, header["experiment"], header.get("experiment_id"))

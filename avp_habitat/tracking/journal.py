@@ -3,23 +3,23 @@
 A journal is a folder: `run.json` (which run, where), `journal.jsonl` (one entry per line), `sent` (how much of it
 MLflow has), `files/` (artifacts), `rejected.jsonl` (what MLflow refuses), and `lock`, held by the process that
 writes. Every entry is one `write` to the system, so a process that is killed loses none; losing the machine may lose
-the last ones. Where the disk takes nothing, entries wait in memory instead.
+the last ones. Entries that the disk does not take wait in memory until it does.
 """
 
 import fcntl
 import json
 import os
 import shutil
-import tempfile
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 from avp_habitat.tracking.names import OFFLINE
+from avp_habitat.tracking.stores import TrackingError
 
 SPOOL_VARIABLE = "AVP_MLFLOW_SPOOL"
 VERSION = 1
@@ -40,16 +40,16 @@ def headers(spool: Path) -> dict[Path, dict[str, Any]]:
     return {path: header for path in sorted(spool.glob("*")) if (header := Journal.peek(path)) is not None}
 
 
-def journal_of(spool: Path, run_id: str) -> Path | None:
+def journal_of(run_id: str) -> Path | None:
     """The folder of the journal of a run, in use or left; None when there is none."""
-    found = headers(spool).items()
+    found = headers(spool_folder()).items()
     return next((path for path, one in found if run_id in (one["run_id"], f"{OFFLINE}{one['key']}")), None)
 
 
 class Journal:
     """The journal of one run; one thread may append while another one reads."""
 
-    def __init__(self, folder: Path | None, header: Mapping[str, Any]) -> None:
+    def __init__(self, folder: Path, header: Mapping[str, Any]) -> None:
         """Use `create` or `adopt`."""
         self.folder = folder
         self.header = dict(header)
@@ -57,26 +57,28 @@ class Journal:
         self._waiting: deque[dict[str, Any]] = deque()
         self._descriptors: list[int] = []
         self._file = self._mark = -1
-        self._size = self._sent = 0
-        self._read_to = 0
-        self._read_waiting = 0
-        self._temporary: tempfile.TemporaryDirectory[str] | None = None
+        self._size = self._sent = self._read_to = self._read_waiting = 0
         self.problem: str | None = None
         """Why the disk takes nothing; None while it does."""
 
     @classmethod
-    def create(cls, spool: Path, header: Mapping[str, Any]) -> "Journal":
-        """A new journal; in memory, with `problem` set, when the disk takes none."""
-        folder = spool / str(header["key"])
-        journal = cls(folder, header)
+    def create(cls, header: Mapping[str, Any]) -> "Journal":
+        """A new journal in the spool folder.
+
+        Raises:
+            TrackingError: the disk takes none.
+        """
+        journal = cls(spool_folder() / header["key"], header)
         try:
-            folder.mkdir(parents=True, mode=0o700)
+            journal.folder.mkdir(parents=True, mode=0o700)
             journal._open()
             journal._write_header()
         except OSError as error:
-            journal.release()
-            shutil.rmtree(folder, ignore_errors=True)
-            journal.folder, journal.problem = None, f"{folder}: {error.strerror or error}"
+            journal.remove()
+            reason = f"{journal.folder}: cannot be written: {error.strerror or error}"
+            raise TrackingError(
+                f"{reason}; MLflow's points are kept there, name another folder in {SPOOL_VARIABLE}"
+            ) from None
         return journal
 
     @classmethod
@@ -137,7 +139,7 @@ class Journal:
                 data += os.pread(self._file, _CHUNK, self._sent + len(data))
             data = data[: data.rindex(b"\n") + 1]
             self._read_to, self._read_waiting = self._sent + len(data), 0
-            return [_parsed(line) for line in data.splitlines()]
+            return list(_parsed(data))
 
     def acknowledge(self) -> None:
         """Note that MLflow has what `read` gave last."""
@@ -163,65 +165,49 @@ class Journal:
 
     def reject(self, entry: Mapping[str, Any], reason: str) -> None:
         """Keep an entry that MLflow refuses, with its reason, beside the others."""
-        if self.folder is not None:
-            with suppress(OSError), (self.folder / _REJECTED).open("a", encoding="utf-8") as file:
-                file.write(json.dumps({**entry, "reason": reason}) + "\n")
+        with suppress(OSError), (self.folder / _REJECTED).open("a", encoding="utf-8") as file:
+            file.write(json.dumps({**entry, "reason": reason}) + "\n")
 
     def restore_rejected(self) -> None:
         """Put refused entries back, to be tried again."""
-        if self.folder is None or not self.has_rejected:
-            return
-        path = self.folder / _REJECTED
-        for line in path.read_bytes().splitlines():
-            self.append({key: value for key, value in _parsed(line).items() if key != "reason"})
-        path.unlink()
+        if self.has_rejected:
+            path = self.folder / _REJECTED
+            for entry in _parsed(path.read_bytes()):
+                self.append({key: value for key, value in entry.items() if key != "reason"})
+            path.unlink()
 
     @property
     def has_rejected(self) -> bool:
         """Whether MLflow refused something."""
-        return self.folder is not None and (self.folder / _REJECTED).is_file()
+        return (self.folder / _REJECTED).is_file()
 
-    @contextmanager
-    def new_file(self, name: str) -> Iterator[Path]:
-        """Where to write a file that an entry will name; it is removed again when writing fails.
+    def new_file(self, name: str) -> Path:
+        """Where to write a file that an entry will name.
 
         Raises:
             OSError: the disk does not take it.
         """
-        if self.folder is None and self._temporary is None:
-            self._temporary = tempfile.TemporaryDirectory(prefix="avp-mlflow-")
-        home = Path(self.folder or self._temporary.name) / "files" / uuid4().hex  # type: ignore[union-attr]
+        home = self.folder / "files" / uuid4().hex
         home.mkdir(parents=True)
-        try:
-            yield home / name
-        except BaseException:
-            shutil.rmtree(home, ignore_errors=True)
-            raise
+        return home / name
 
     def remove(self) -> None:
         """Remove the journal, of which MLflow has everything."""
-        if self.folder is not None:
-            # First of all, so that nobody adopts it as soon as the lock is free.
-            with suppress(OSError):
-                (self.folder / _HEADER).unlink()
+        # First of all, so that nobody adopts it as soon as the lock is free.
+        with suppress(OSError):
+            (self.folder / _HEADER).unlink()
         self.release()
-        if self.folder is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)
-            with suppress(OSError):
-                self.folder.parent.rmdir()  # when it was the last one
+        shutil.rmtree(self.folder, ignore_errors=True)
+        with suppress(OSError):
+            self.folder.parent.rmdir()  # when it was the last one
 
     def release(self) -> None:
         """Leave the journal to the next process."""
         while self._descriptors:
             os.close(self._descriptors.pop())
-        if self.folder is not None:
-            _ours.discard(self.folder)
-        if self._temporary is not None:
-            self._temporary.cleanup()
-            self._temporary = None
+        _ours.discard(self.folder)
 
     def _open(self) -> None:
-        assert self.folder is not None
         fcntl.lockf(self._descriptor(_LOCK), fcntl.LOCK_EX | fcntl.LOCK_NB)
         _ours.add(self.folder)
         self._file, self._mark = self._descriptor(_ENTRIES), self._descriptor(_SENT)
@@ -231,18 +217,16 @@ class Journal:
         self._mark_sent()
 
     def _descriptor(self, name: str) -> int:
-        assert self.folder is not None
         self._descriptors.append(os.open(self.folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
         return self._descriptors[-1]
 
     def _write_header(self) -> None:
-        if self.folder is not None:
-            new = self.folder / "run.new"
-            new.write_text(json.dumps(self.header, indent=1) + "\n", encoding="utf-8")
-            new.rename(self.folder / _HEADER)
+        new = self.folder / "run.new"
+        new.write_text(json.dumps(self.header, indent=1) + "\n", encoding="utf-8")
+        new.rename(self.folder / _HEADER)
 
     def _write_waiting(self) -> None:
-        while self._waiting and self.folder is not None:
+        while self._waiting:
             line = json.dumps(self._waiting[0], separators=(",", ":")).encode() + b"\n"
             try:
                 if os.pwrite(self._file, line, self._size) < len(line):
@@ -272,10 +256,8 @@ def _whole_lines(file: int) -> int:
     return end
 
 
-def _parsed(line: bytes) -> dict[str, Any]:
-    """An entry; `damaged` holds a line that is none."""
-    try:
-        entry = json.loads(line)
-    except ValueError:
-        entry = None
-    return entry if isinstance(entry, dict) else {"damaged": line.decode(errors="replace")}
+def _parsed(data: bytes) -> Iterator[dict[str, Any]]:
+    """The entries of some lines; a damaged one, which only losing the machine leaves, is left out."""
+    for line in data.splitlines():
+        with suppress(ValueError):
+            yield json.loads(line)

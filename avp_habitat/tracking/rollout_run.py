@@ -47,19 +47,15 @@ _ORIGIN = {
 
 
 def rollout_run(store: "MlflowClient | str", folder: str | Path, *, experiment: str | None = None) -> str:
-    """The MLflow run of a rollout, which is made when the store has none.
+    """The id of the MLflow run of a rollout, which is made when the store has none.
 
     A rollout is recognised by its contents (`rollout_id`), wherever its folder lies. Its run is a child of the run
-    that trained the policy, in the experiment of that, when the store has it.
+    that trained the policy, in the experiment of that; or else in that of `experiments.chosen_experiment`.
 
     Args:
         store: its client, or its address.
         folder: of the rollout, or its `rollout.json`.
-        experiment: of a rollout whose policy's run the store does not have; as `experiments.chosen_experiment` says
-            when omitted.
-
-    Returns:
-        The run's id.
+        experiment: of a rollout whose policy's run the store does not have.
 
     Raises:
         RolloutError: the rollout cannot be read.
@@ -105,11 +101,7 @@ def rollout_id(folder: Path) -> str:
 
 
 def origin(meta: Mapping[str, Any]) -> dict[str, str]:
-    """Tags that name scene, simulator and policy as those of the policy's training do.
-
-    Args:
-        meta: `rollout.json`.
-    """
+    """Tags by `rollout.json` that name scene, simulator and policy as those of the policy's training do."""
     leaves = flat({key: meta[key] for key in ("scene", "policy", "simulator") if isinstance(meta.get(key), Mapping)})
     tags = {tag: str(leaves[key]) for tag, key in _ORIGIN.items() if leaves.get(key) is not None}
     # One colour per policy on all of the experiment's pages.
@@ -117,11 +109,7 @@ def origin(meta: Mapping[str, Any]) -> dict[str, str]:
 
 
 def title(meta: Mapping[str, Any]) -> str | None:
-    """Policy, scene and seed, in words; the reward too of a policy that was trained. None where a rollout has no names.
-
-    Args:
-        meta: `rollout.json`.
-    """
+    """Policy, scene and seed by `rollout.json`, also the reward of a model; None where a rollout has no names."""
     named = origin(meta)
     if not {names.POLICY_TAG, names.SCENE_TAG} <= named.keys():
         return None
@@ -132,22 +120,13 @@ def title(meta: Mapping[str, Any]) -> str | None:
 
 
 def rollout_params(meta: Mapping[str, Any]) -> dict[str, str]:
-    """`rollout.seed`, `rollout.budget`, ...: what a rollout was collected with.
-
-    Args:
-        meta: `rollout.json`.
-    """
+    """`rollout.seed`, `rollout.budget`, ...: what a rollout was collected with by its `rollout.json`."""
     leaves = flat({key: meta[key] for key in _SETTINGS if key in meta})
     return {safe_name(f"rollout.{key}"): str(value) for key, value in leaves.items()}
 
 
 def figures(meta: Mapping[str, Any], prefix: str = "eval") -> dict[str, float]:
-    """`eval/coverage`, `eval/views`, ...: the names under which the policy's evaluation logs them.
-
-    Args:
-        meta: `rollout.json`, checked by `read_rollout` or `read_meta`.
-        prefix: of the names.
-    """
+    """`eval/coverage`, `eval/views`, ... by a checked `rollout.json`, as the policy's evaluation names them."""
     found = {name: float(value) for name, value in meta.get("metrics", {}).items()}
     if found.get("views") and "coverage" in found:
         # One number of the policy's evaluation is written in no rollout, because it follows from two others.
@@ -156,11 +135,7 @@ def figures(meta: Mapping[str, Any], prefix: str = "eval") -> dict[str, float]:
 
 
 def policy_run_id(folder: Path, meta: Mapping[str, Any]) -> str | None:
-    """MLflow run in which a rollout's policy was trained; None for a baseline.
-
-    Args:
-        folder: of the rollout.
-        meta: its `rollout.json`.
+    """MLflow run in which the policy of a rollout's `rollout.json` was trained; None for a baseline.
 
     Raises:
         RolloutError: what stands there cannot be the id of a run.
@@ -198,7 +173,7 @@ def _made(
     name = rollout.folder.resolve().name if named is None else f"{names.ROLLOUT} {named}"
     ours = client.create_run(home, run_name=name, tags=tags)
     _fill(client, ours, rollout)
-    # MLflow cannot make a run only if there is none: a program on another machine may have made it meanwhile, too.
+    # A program on another machine may have made it meanwhile, too.
     first = _found(client, tags) or ours
     if first.info.run_id != ours.info.run_id:
         client.delete_run(ours.info.run_id)
@@ -246,13 +221,7 @@ def _replace(client: "MlflowClient", run: "Run", tags: dict[str, str], old: set[
 
 
 def command_for(folder: Path, option: str, experiment: str | None = None) -> str:
-    """The command line that logs a rollout.
-
-    Args:
-        folder: of the rollout.
-        option: `auto`, or an address; its password is not repeated.
-        experiment: as in `rollout_run`.
-    """
+    """The command line that logs a rollout; `option` is `auto`, or an address whose password is not repeated."""
     words = ["python", "-m", "avp_habitat.tracking.rollout_run", str(folder)]
     words += [] if option == "auto" else ["--mlflow", shown(option)]
     return shlex.join(words if experiment is None else [*words, "--experiment", experiment])

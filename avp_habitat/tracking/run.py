@@ -7,12 +7,13 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal
 from uuid import uuid4
 
 from avp_habitat.errors import AVPError
-from avp_habitat.tracking.delivery import INTERVAL_S, Sender
+from avp_habitat.tracking.delivery import Sender
 from avp_habitat.tracking.experiments import chosen_experiment, create_run, existing_run, find_run
 from avp_habitat.tracking.journal import VERSION, Journal, journal_of, spool_folder
 from avp_habitat.tracking.names import IMAGES_TAG, MAX_PARAM, MAX_TAG, OFFLINE, RENAMED_TAG, SafeNames, safe_name
@@ -35,28 +36,11 @@ class TrackedRun:
     Made by `start_run`, `continue_run` and `join_run`. All methods may be called from any thread, one at a time.
     """
 
-    def __init__(
-        self,
-        journal: Journal,
-        client: "MlflowClient | None",
-        *,
-        uncertain: bool = False,
-        interval_s: float = INTERVAL_S,
-    ) -> None:
-        """Fill the run of a journal.
-
-        Args:
-            journal: of the run.
-            client: of its store; None connects when something is to be sent.
-            uncertain: whether an earlier process may have sent some of the journal.
-            interval_s: between two calls of MLflow.
-        """
+    def __init__(self, journal: Journal, client: "MlflowClient | None", **options: Any) -> None:
+        """Fill the run of a journal; options as of `Sender`."""
         self._journal = journal
         self._names = SafeNames()
-        self._sender = Sender(journal, client, uncertain=uncertain, interval_s=interval_s)
-        if journal.problem is not None:
-            text = f"MLflow's points cannot be kept on disk ({journal.problem}), only in memory"
-            self._sender.warn_once("disk", text)
+        self._sender = Sender(journal, client, **options)
 
     @property
     def run_id(self) -> str:
@@ -67,11 +51,6 @@ class TrackedRun:
     def address(self) -> str:
         """Of the store, as MLflow is given it; it may hold a password."""
         return self._journal.header["address"]
-
-    @property
-    def folder(self) -> Path | None:
-        """The journal's, while there is one."""
-        return self._journal.folder
 
     def metrics(self, values: Mapping[str, float], step: int, *, timestamp_ms: int | None = None) -> None:
         """Add numbers at a step; names that MLflow refuses are changed, which the tag `avp.renamed` says."""
@@ -98,20 +77,14 @@ class TrackedRun:
             self._append({"params": {safe_name(name): str(value)[:MAX_PARAM] for name, value in values.items()}})
 
     def save(self, path: str, write: Callable[[Path], object]) -> bool:
-        """Keep an artifact that `write` writes to a file; whether that worked, which a full disk prevents.
-
-        Args:
-            path: of the artifact within the run; one of the same name is replaced.
-            write: given a path that ends like `path`, makes that file.
-        """
+        """Keep an artifact, in place of one of that path, that `write` writes to its file; whether the disk took it."""
         try:
-            with self._journal.new_file(PurePosixPath(path).name) as file:
-                write(file)
+            file = self._journal.new_file(PurePosixPath(path).name)
+            write(file)
         except OSError as error:
             self._sender.warn_once(f"file {path}", f"MLflow run {self.run_id}: {path} cannot be kept: {error}")
             return False
-        folder = self._journal.folder
-        self._append({"file": str(file.relative_to(folder) if folder else file), "path": path})
+        self._append({"file": str(file.relative_to(self._journal.folder)), "path": path})
         return True
 
     def file(self, source: Path, path: str | None = None) -> bool:
@@ -128,62 +101,52 @@ class TrackedRun:
         # By such names MLflow's UI knows a series of pictures: MlflowClient.log_image in mlflow/tracking/client.py.
         series = safe_name(name).replace("/", "~")
         stem = f"images/{series}+step+{step}+timestamp+{int(time.time() * 1000)}+{uuid4()}"
-        self.save(f"{stem}.png", lambda file: picture.save(file, compress_level=1))
-        self.save(f"{stem}+compressed.webp", lambda file: small.save(file, quality=80))
+        self.save(f"{stem}.png", partial(picture.save, compress_level=1))
+        self.save(f"{stem}+compressed.webp", partial(small.save, quality=80))
         self.tags({IMAGES_TAG: "True"})
 
     def flush(self, timeout_s: float = _CLOSING_S) -> bool:
         """Wait until MLflow has everything; whether it has."""
         return self._sender.drain(timeout_s)
 
-    def close(self, status: Status, *, at_ms: int | None = None, timeout_s: float = _CLOSING_S) -> bool:
+    def close(self, status: Status | None, *, at_ms: int | None = None, timeout_s: float = _CLOSING_S) -> bool:
         """Send the rest and end the run; whether MLflow has everything. What it does not have stays on disk.
 
         Args:
-            status: of the run; a run that is not ours keeps its own.
+            status: of the run; None leaves it as it is, and a run that is not ours keeps its own.
             at_ms: when it ended, milliseconds since 1970; now when omitted.
             timeout_s: to wait for a store at most without any progress.
         """
+        journal = self._journal
         try:
-            self._journal.update({"ended": status})
-            if self._journal.header["owned"]:
-                self._append({"end": status, "at": at_ms or int(time.time() * 1000)})
-        finally:
-            delivered = self.leave(timeout_s=timeout_s)
-        return delivered
-
-    def leave(self, *, timeout_s: float = _CLOSING_S) -> bool:
-        """Send the rest without ending the run; whether MLflow has everything."""
-        journal, idle = self._journal, False
-        try:
+            if status is not None:
+                journal.update({"ended": status})
+                if journal.header["owned"]:
+                    self._append({"end": status, "at": at_ms or int(time.time() * 1000)})
             self._sender.drain(timeout_s)
         finally:
             # A thread that hangs in a call keeps the journal until this process ends.
-            idle = self._sender.stop()
-            if idle and not journal.pending and not journal.has_rejected:
+            stopped = self._sender.stop()
+            if stopped and not journal.pending and not journal.has_rejected:
                 journal.remove()
             else:
                 self._say_what_stays()
-                if idle:
+                if stopped:
                     journal.release()
         return not journal.pending
 
     def _say_what_stays(self) -> None:
-        journal = self._journal
-        where = f"stay in {journal.folder}; send them with: {DELIVER}"
-        if journal.folder is None:
-            where = "are lost, because the disk takes nothing either"
-        if journal.pending:
-            store, reason = shown(self.address), self._sender.problem or "it was too slow"
-            text = "MLflow at %s did not take all of run %s (%s); its last points %s"
-            _log.warning(text, store, self.run_id, reason, where)
+        where = f"stay in {self._journal.folder}; send them with: {DELIVER}"
+        if self._journal.pending:
+            reason = f"did not take all of run {self.run_id} ({self._sender.problem or 'it was too slow'})"
+            _log.warning("MLflow at %s %s; its last points %s", shown(self.address), reason, where)
         else:
             _log.warning("MLflow refused some of run %s; those points %s --again", self.run_id, where)
 
     def _append(self, entry: dict[str, Any]) -> None:
         self._journal.append(entry)
-        if self._journal.folder is not None and self._journal.problem is not None:
-            self._sender.warn_once("disk", f"MLflow's points cannot be kept on disk now ({self._journal.problem})")
+        if (problem := self._journal.problem) is not None:
+            self._sender.warn_once("disk", f"MLflow's points wait in memory, the disk takes none now: {problem}")
 
 
 @dataclass(frozen=True)
@@ -193,28 +156,20 @@ class NewRun:
     experiment: str | None = None
     """Made when it does not exist; as `experiments.chosen_experiment` says when None."""
     name: str | None = None
-    """Of the run; MLflow invents one when None, the same one after each training that was seeded alike."""
+    """MLflow invents one when None, the same one after each training that was seeded alike."""
     tags: Mapping[str, str] = field(default_factory=dict)
     """Beside those of MLflow's run context."""
     parent: str | None = None
     """Id of the run below which MLflow shows this one, when both lie in one experiment."""
 
 
-def start_run(
-    address: str, new: NewRun, *, offline: bool | None = None, spool: Path | None = None, **options: Any
-) -> TrackedRun:
-    """Begin a run.
+def start_run(address: str, new: NewRun, *, offline: bool | None = None, **options: Any) -> TrackedRun:
+    """Begin a run; with `offline` although the store does not answer (None: as `AVP_MLFLOW_OFFLINE` says).
 
-    Args:
-        address: of the store.
-        new: what the run is made from.
-        offline: True begins although the store does not answer; the run is made when it does. None: as
-            `AVP_MLFLOW_OFFLINE` says.
-        spool: folder of the journals; `spool_folder()` when None.
-        **options: of `TrackedRun`.
+    Options are those of `Sender`, as for the other ways to open a run.
 
     Raises:
-        TrackingError: the store cannot be reached (and `offline` is not set), or refuses.
+        TrackingError: the store cannot be reached, or refuses.
     """
     client = open_store(address, offline=offline, option="offline=True")
     from mlflow.tracking.context.registry import resolve_tags
@@ -226,39 +181,27 @@ def start_run(
         "name": new.name,
         "tags": resolve_tags() | dict(new.tags),
         "parent": new.parent,
-        "creating": True,
     }
-    journal = Journal.create(spool or spool_folder(), header)
+    journal = Journal.create(header)
     if client is not None:
         try:
-            journal.update({"run_id": create_run(client, header | {"creating": False})})
-        except BaseException as error:
+            journal.update({"run_id": create_run(client, header)})
+        except Exception as error:
             journal.remove()
-            if isinstance(error, AVPError) or not isinstance(error, Exception):
+            if isinstance(error, AVPError):
                 raise
             raise TrackingError(f"MLflow at {shown(address)} did not take the run: {first_line(error)}") from error
     return TrackedRun(journal, client, **options)
 
 
-def continue_run(
-    address: str, run_id: str, *, offline: bool | None = None, spool: Path | None = None, **options: Any
-) -> TrackedRun:
-    """Go on with a run, with what its journal still holds when its process was killed.
-
-    Args:
-        address: of the store.
-        run_id: MLflow's, or the one given offline.
-        offline: as in `start_run`.
-        spool: as in `start_run`.
-        **options: of `TrackedRun`.
+def continue_run(address: str, run_id: str, *, offline: bool | None = None, **options: Any) -> TrackedRun:
+    """Go on with a run of MLflow's id or of one given offline, with what its journal still holds from a killed process.
 
     Raises:
-        TrackingError: the store cannot be reached (and `offline` is not set), or has no such run, or the run is being
-            written by another process.
+        TrackingError: the store cannot be reached, or has no such run, or another process is writing the run.
     """
-    home = spool or spool_folder()
     client = open_store(address, offline=offline, option="offline=True")
-    folder = journal_of(home, run_id)
+    folder = journal_of(run_id)
     if folder is not None:
         journal = Journal.adopt(folder)
         if journal is None:
@@ -268,20 +211,20 @@ def continue_run(
         if client is not None:
             run_id = existing_run(client, run_id).info.run_id
         elif run_id.startswith(OFFLINE):
-            raise TrackingError(f"MLflow run {run_id}: expected its journal in {home}, found none")
-        journal = Journal.create(home, _header(address) | {"run_id": run_id, "continue": True})
+            raise TrackingError(f"MLflow run {run_id}: expected its journal in {spool_folder()}, found none")
+        journal = Journal.create(_header(address) | {"run_id": run_id, "continue": True})
     if client is not None and journal.header["run_id"] is not None:
         client.update_run(journal.header["run_id"], status="RUNNING")
         journal.header["continue"] = False
     return TrackedRun(journal, client, uncertain=folder is not None, **options)
 
 
-def may_continue(address: str, run_id: str, *, spool: Path | None = None) -> bool:
+def may_continue(address: str, run_id: str) -> bool:
     """Whether a run was interrupted, so that going on with its model goes on with the run.
 
     A run that MLflow takes for running, and of which this machine has no journal, may be running elsewhere.
     """
-    folder = journal_of(spool or spool_folder(), run_id)
+    folder = journal_of(run_id)
     if folder is not None and (journal := Journal.adopt(folder)) is not None:
         journal.release()
         return journal.header["ended"] != "FINISHED"
@@ -292,22 +235,15 @@ def may_continue(address: str, run_id: str, *, spool: Path | None = None) -> boo
     return run is not None and run.info.status in ("KILLED", "FAILED")
 
 
-def join_run(address: str, run_id: str, *, spool: Path | None = None, **options: Any) -> TrackedRun:
+def join_run(address: str, run_id: str, **options: Any) -> TrackedRun:
     """Fill a run that somebody else has opened and will end.
-
-    Args:
-        address: of the store.
-        run_id: of the run.
-        spool: as in `start_run`.
-        **options: of `TrackedRun`.
 
     Raises:
         TrackingError: the store cannot be reached or has no such run.
     """
     client = connect(address)
     run_id = existing_run(client, run_id).info.run_id
-    header = _header(address) | {"run_id": run_id, "owned": False}
-    return TrackedRun(Journal.create(spool or spool_folder(), header), client, **options)
+    return TrackedRun(Journal.create(_header(address) | {"run_id": run_id, "owned": False}), client, **options)
 
 
 def _header(address: str) -> dict[str, Any]:

@@ -37,15 +37,7 @@ class StoreUnreachableError(TrackingError):
 
 
 def address_of(option: str, *, default: str | None) -> str | None:
-    """The MLflow address that an option means.
-
-    Args:
-        option: an address, `auto` for `MLFLOW_TRACKING_URI`, or `off`.
-        default: of `auto` where that variable is not set.
-
-    Returns:
-        None for no tracking.
-    """
+    """The address that an option means: itself, `auto` for `MLFLOW_TRACKING_URI` or else `default`; None for `off`."""
     if option == "off":
         return None
     return os.environ.get("MLFLOW_TRACKING_URI") or default if option == "auto" else option
@@ -64,13 +56,7 @@ def how_to_look(address: str) -> str:
 
 
 def about_run(run_id: str, address: str, *, delivered: bool = True) -> str:
-    """Two lines on a run.
-
-    Args:
-        run_id: MLflow's, or one given offline.
-        address: of its store.
-        delivered: whether MLflow has all of it.
-    """
+    """Two lines on a run of a store: which one it is, and how to look at it, or to send what is not `delivered`."""
     send = f"send:     {DELIVER}  (MLflow does not have all of the run yet)"
     return f"MLflow:   run {run_id}\n" + (f"compare:  {how_to_look(address)}" if delivered else send)
 
@@ -78,11 +64,9 @@ def about_run(run_id: str, address: str, *, delivered: bool = True) -> str:
 def absolute(address: str) -> str:
     """An address that means the same in every folder."""
     file = file_of(address)
-    if file is None:
-        return address if urlsplit(address).scheme else str(Path(address).absolute())
-    from sqlalchemy.engine import make_url
-
-    return make_url(address).set(database=str(file)).render_as_string(hide_password=False)
+    if file is not None:
+        return _with_file(address, file)
+    return address if urlsplit(address).scheme else str(Path(address).absolute())
 
 
 def file_of(address: str) -> Path | None:
@@ -95,11 +79,10 @@ def file_of(address: str) -> Path | None:
     return None if name == ":memory:" or name.startswith("file:") else Path(name).absolute()
 
 
-def sqlite_address(path: Path) -> str:
-    """What names a database file for MLflow, whatever characters its path has."""
-    from sqlalchemy.engine import URL
+def _with_file(address: str, file: Path) -> str:
+    from sqlalchemy.engine import make_url
 
-    return URL.create("sqlite", database=str(path)).render_as_string()
+    return make_url(address).set(database=str(file)).render_as_string(hide_password=False)
 
 
 def is_missing(address: str) -> bool:
@@ -109,12 +92,9 @@ def is_missing(address: str) -> bool:
 
 
 def open_store(address: str, *, offline: bool | None = None, option: str | None = None) -> "MlflowClient | None":
-    """A client of the store; None when it does not answer and we are told to go on without it.
+    """A client of the store; None when it does not answer and `offline`, or else `AVP_MLFLOW_OFFLINE`, allows that.
 
-    Args:
-        address: of the store.
-        offline: whether to go on without it; None as the variable `AVP_MLFLOW_OFFLINE` says.
-        option: how the caller's users say so, for the error's text, beside that variable.
+    `option` is how the caller's users say so beside that variable, for the error's text.
 
     Raises:
         TrackingError: the store cannot be used.
@@ -128,8 +108,8 @@ def open_store(address: str, *, offline: bool | None = None, option: str | None 
         raise StoreUnreachableError(f"{error}; to go on without it and send everything later: {ways}") from None
 
 
-def connect(address: str) -> "MlflowClient":
-    """A client of a store that answers.
+def connect(address: str, *, make: bool = True) -> "MlflowClient":
+    """A client of a store that answers; `make` makes a database that is missing.
 
     Raises:
         StoreUnreachableError: the store cannot be reached now.
@@ -145,14 +125,14 @@ def connect(address: str) -> "MlflowClient":
     except ImportError as error:
         raise TrackingError(f"MLflow is asked for but not installed ({error}): pip install mlflow") from None
     file = file_of(address)
-    if file is not None and (problem := _fault_of(file)) is not None:
+    if file is not None and (problem := _fault_of(file, make)) is not None:
         elsewhere = "name another place, such as MLFLOW_TRACKING_URI=sqlite:////tmp/mlflow.db"
         raise StoreUnreachableError(f"MLflow at {shown(address)} cannot be used: {problem}; {elsewhere}")
     try:
         # Programs that start at once make one database, one after the other.
         with nullcontext() if file is None else locked(hashlib.sha256(os.fsencode(file)).hexdigest()[:16]):
             if file is not None and not file.exists():
-                _make_database(file)
+                _make_database(address, file)
             client = MlflowClient(address)
             client.search_experiments(max_results=1)
     except Exception as error:
@@ -197,10 +177,12 @@ def locked(name: str) -> Iterator[None]:
         yield
 
 
-def _fault_of(path: Path) -> str | None:
+def _fault_of(path: Path, make: bool) -> str | None:
     """Why MLflow could not use a file, existing or not; None when it can. MLflow itself tries for two minutes."""
     if path.is_dir():
         return "it is a folder"
+    if not (make or path.exists()):
+        return "the database is gone"
     # A file that cannot be read is named below.
     with suppress(OSError), path.open("rb") as file:
         if file.read(len(_MAGIC)) not in (b"", _MAGIC):
@@ -212,7 +194,7 @@ def _fault_of(path: Path) -> str | None:
     return f"{unwritable[0]} cannot be written" if unwritable else None
 
 
-def _make_database(path: Path) -> None:
+def _make_database(address: str, path: Path) -> None:
     """Make a database, which appears when it has all tables: MLflow cannot go on with one that is half-made."""
     from mlflow.store.db import utils
 
@@ -220,7 +202,7 @@ def _make_database(path: Path) -> None:
     part = path.with_name(f".{path.name}.{socket.gethostname()}-{os.getuid()}.part")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
-    engine = utils.create_sqlalchemy_engine(sqlite_address(part / path.name))
+    engine = utils.create_sqlalchemy_engine(_with_file(address, part / path.name))
     try:
         utils._initialize_tables(engine)
         engine.dispose()

@@ -35,6 +35,9 @@ Chart = dict[str, Any]
 """A chart as MLflow's page keeps it, with one colour per run."""
 
 
+_CHART: Chart = {"deleted": False, "isGenerated": False, "runsCountToCompare": 100}
+
+
 def _bar(metric: str) -> Chart:
     """A bar per run."""
     return {"type": "BAR", "metricKey": metric}
@@ -58,46 +61,32 @@ def _images(name: str) -> Chart:
     return {"type": "IMAGE", "imageKeys": [name], "step": 0}
 
 
-_ALWAYS = {
-    "orderByAsc": False,
-    "startTime": "ALL",
-    "lifecycleFilter": "Active",
-    "datasetsFilter": [],
-    "modelVersionFilter": "All Runs",
-    "runsExpanded": {},
-    "runsPinned": [],
-    "runsHidden": [],
-    "runsVisibilityMap": {},
-    "runsHiddenMode": "SHOW_ALL",
-    "viewMaximized": False,
-    "runListHidden": False,
-    "isAccordionReordered": True,
-    "useGroupedValuesInCharts": True,
-    "hideEmptyCharts": True,
-    "groupBy": None,
-    "groupsExpanded": {},
-    "autoRefreshEnabled": True,
-    "globalLineChartConfig": {"xAxisKey": "step", "lineSmoothness": 0, "selectedXAxisMetricKey": ""},
-    "chartsSearchFilter": "",
-}
+# What the page keeps beside, as MLflow 3.17 writes it.
+_ALWAYS = json.loads("""{
+    "orderByAsc": false, "startTime": "ALL", "lifecycleFilter": "Active", "datasetsFilter": [],
+    "modelVersionFilter": "All Runs", "runsExpanded": {}, "runsPinned": [], "runsHidden": [], "runsVisibilityMap": {},
+    "runsHiddenMode": "SHOW_ALL", "viewMaximized": false, "runListHidden": false, "isAccordionReordered": true,
+    "useGroupedValuesInCharts": true, "hideEmptyCharts": true, "groupBy": null, "groupsExpanded": {},
+    "autoRefreshEnabled": true, "chartsSearchFilter": "",
+    "globalLineChartConfig": {"xAxisKey": "step", "lineSmoothness": 0, "selectedXAxisMetricKey": ""}
+}""")
 
 
 @dataclass(frozen=True)
 class View:
-    """A view of the runs page."""
+    """A view of the runs page.
+
+    `key` names it in addresses, `title` in the page's menu; `runs` is MLflow's filter of the runs that it shows.
+    `columns` of its table are metrics as `eval/psnr`, tags as `avp.policy` and parameters as `env.reward`; by `order`,
+    one of them, runs are sorted, the largest first. `charts` are groups by title, from top to bottom.
+    """
 
     key: str
-    """Names it in addresses."""
     title: str
-    """In the page's menu of views."""
     runs: str
-    """MLflow's search filter of the runs that it shows."""
     columns: str
-    """Of its table, from left to right: metrics as `eval/psnr`, tags as `avp.policy`, parameters as `env.reward`."""
     order: str
-    """Column by which runs are sorted, the largest first."""
     charts: dict[str, list[Chart]]
-    """Groups by title, from top to bottom."""
 
     def tag(self, created_ms: int) -> str:
         """Value of the experiment's tag that holds it, as MLflow's page keeps it."""
@@ -113,11 +102,7 @@ class View:
             "columnWidths": {_column(name): max(120, 40 + 7 * len(name)) for name in self.columns.split()},
             "compareRunSections": [{"uuid": ids[name], "name": name, **shown} for name in self.charts],
             "compareRunCharts": [
-                {
-                    **{"uuid": f"{ids[name]}-{number}", "metricSectionId": ids[name]},
-                    **{"deleted": False, "isGenerated": False, "runsCountToCompare": 100},
-                    **chart,
-                }
+                {"uuid": f"{ids[name]}-{number}", "metricSectionId": ids[name], **_CHART, **chart}
                 for name, charts in self.charts.items()
                 for number, chart in enumerate(charts)
             ],
@@ -187,12 +172,7 @@ def run_colour(policy: str) -> str:
 def prepare_experiment(client: "MlflowClient", experiment_id: str) -> str:
     """Give an experiment its description and its views, once; later changes by people stay.
 
-    A store that refuses is a logged warning, because a training does not need its page; a version of MLflow that has
-    no such views leaves them alone.
-
-    Args:
-        client: of the store.
-        experiment_id: of an existing experiment.
+    A store that refuses is a logged warning, because a training does not need its page.
 
     Returns:
         What follows the server's address, to open the reconstructions.

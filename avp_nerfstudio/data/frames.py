@@ -13,8 +13,7 @@ from tqdm import tqdm
 from avp_habitat.errors import RolloutError
 from avp_habitat.poses import Intrinsics, pixel_directions, y_up_to_z_up
 from avp_habitat.rollout.format import Rollout, View, read_rollout
-from avp_habitat.rollout.images import read_depth, read_rgb
-from avp_habitat.rollout.png import check_png_contents
+from avp_habitat.rollout.images import check_png_contents, read_depth, read_rgb
 
 Order = Literal["steps", "spread", "random"]
 

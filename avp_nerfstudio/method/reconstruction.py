@@ -32,7 +32,6 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 
 from avp_habitat.command import progress
-from avp_habitat.files import NewFolder
 from avp_habitat.provenance import git_commit, installed_versions
 from avp_habitat.rollout.format import Rollout
 from avp_habitat.rollout.images import write_rgb
@@ -45,7 +44,7 @@ from avp_nerfstudio.method.scores import heldout_count, mean_scores, optional_lp
 from avp_nerfstudio.tracking.mlflow import facts_of, open_again
 
 if TYPE_CHECKING:
-    from avp_nerfstudio.reconstruct import Reconstruction
+    from avp_nerfstudio.reconstruct import Reconstruct
 
 _NEVER = 1 << 40
 _OUTPUTS = "nerfstudio"
@@ -53,14 +52,14 @@ _PACKAGES = ("avp-suite", "nerfstudio", "torch", "torchvision", "torchmetrics", 
 
 
 def process(
-    options: "Reconstruction", rollout: Rollout, folder: NewFolder, *, started: float, address: str | None
+    options: "Reconstruct", rollout: Rollout, folder: Path, *, started: float, address: str | None
 ) -> dict[str, Any]:
     """Train, score, and write everything of the folder.
 
     Args:
         options: held to the rollout.
         rollout: the one they name, as read.
-        folder: open.
+        folder: where to write; it becomes `options.out`.
         started: `time.monotonic()` when the work began.
         address: of the MLflow store, None for none.
 
@@ -70,7 +69,7 @@ def process(
     Raises:
         RolloutError: nerfstudio cannot use the rollout.
     """
-    config = _configuration(options, rollout, folder.path(_OUTPUTS).resolve())
+    config = _configuration(options, rollout, folder.resolve() / _OUTPUTS)
     # Of nerfstudio's many lines none is for the screen; bars and warnings go to the other stream.
     with contextlib.redirect_stdout(io.StringIO()):
         trainer = _set_up(config, keep_checkpoint=options.keep_checkpoint)
@@ -105,17 +104,17 @@ def process(
         "commit": git_commit(),
     }
     if options.keep_checkpoint:
-        found["config"] = _keep(config, folder)
+        found["config"] = _keep(config, folder, options.out)
     else:
-        shutil.rmtree(folder.path(_OUTPUTS))
+        shutil.rmtree(folder / _OUTPUTS)
     found = _finite(found)
-    folder.path("scores.json").write_text(json.dumps(found, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    (folder / "scores.json").write_text(json.dumps(found, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     if address is not None:
         _track(address, config, folder, found)
     return found
 
 
-def _configuration(options: "Reconstruction", rollout: Rollout, outputs: Path) -> Any:
+def _configuration(options: "Reconstruct", rollout: Rollout, outputs: Path) -> Any:
     """The `TrainerConfig` of a training that writes to a folder `outputs`."""
     config: Any = trainer_config() if options.method == "avp-nerfacto" else _nerfacto()
     manager = config.pipeline.datamanager
@@ -165,7 +164,7 @@ def _set_up(config: Any, *, keep_checkpoint: bool) -> Any:
     return trainer
 
 
-def _score(pipeline: Any, folder: NewFolder, pictures: tuple[int, ...]) -> list[tuple[str, dict[str, float]]]:
+def _score(pipeline: Any, folder: Path, pictures: tuple[int, ...]) -> list[tuple[str, dict[str, float]]]:
     """Name and scores of each held-out view."""
     pipeline.eval()
     # What ns-eval has after loading a checkpoint, which does not hold how far a short training has annealed.
@@ -179,24 +178,24 @@ def _score(pipeline: Any, folder: NewFolder, pictures: tuple[int, ...]) -> list[
             del scores["lpips"]
         views.append((view.name, scores))
         if view.index in pictures:
-            folder.path("pictures").mkdir(exist_ok=True)
+            (folder / "pictures").mkdir(exist_ok=True)
             for kind, picture in (("truth", view.truth), ("render", view.render)):
-                write_rgb(folder.path("pictures") / f"{kind}_{view.index:05d}.png", to_8_bit(picture))
+                write_rgb(folder / "pictures" / f"{kind}_{view.index:05d}.png", to_8_bit(picture))
     return views
 
 
-def _keep(config: Any, folder: NewFolder) -> str:
+def _keep(config: Any, folder: Path, final: Path) -> str:
     """Write `config.yml` as it is to be read where the folder goes; gives its path within the folder."""
     path = config.get_base_dir() / "config.yml"
-    config.output_dir = (folder.folder / _OUTPUTS).resolve()
+    config.output_dir = final.resolve() / _OUTPUTS
     path.write_text(yaml.dump(config), encoding="utf-8")
-    return str(path.relative_to(folder.path("").resolve()))
+    return str(path.relative_to(folder.resolve()))
 
 
-def _track(address: str, config: Any, folder: NewFolder, found: Mapping[str, Any]) -> None:
+def _track(address: str, config: Any, folder: Path, found: Mapping[str, Any]) -> None:
     """Log settings and scores; a store that fails is a warning, because the scores are there."""
     try:
-        run, _ = open_again(address, facts_of(config), folder=folder.path(""))
+        run, _ = open_again(address, facts_of(config), folder=folder)
         values = {**found["scores"], **{k: v for k, v in found["visibility"].items() if k != "per_view"}}
         run.metrics({f"eval/{name}": v for name, v in values.items() if v is not None}, found["iterations"])
         run.close("FINISHED")

@@ -2,8 +2,6 @@
 
 import contextlib
 import functools
-import json
-import math
 import socket
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,8 +16,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor, nn
-
-from avp_habitat.errors import AVPError
 
 LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"
 FULL_ERROR = 0.25
@@ -85,29 +81,6 @@ def render_views(pipeline: Any) -> Iterator[HeldoutView]:
 def mean_scores(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """The mean of each score over the views, which is what `ns-eval` reports."""
     return {name: float(np.mean([row[name] for row in scores])) for name in (scores[0] if scores else {})}
-
-
-def read_scores(path: Path) -> tuple[dict[str, float], str | None]:
-    """`psnr`, `ssim` and, where it was computed, `lpips` of the JSON file named by `ns-eval --output-path`.
-
-    Returns:
-        Them, and the likely reason why LPIPS is missing, None when it is there.
-
-    Raises:
-        AVPError: the file is missing, not JSON, or holds no finite PSNR and SSIM.
-    """
-    try:
-        results = json.loads(path.read_text(encoding="utf-8"))["results"]
-        found = {name: float(results[name]) for name in ("psnr", "ssim", "lpips") if name != "lpips" or name in results}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise AVPError(f"{path}: expected the scores that ns-eval writes, found none: {error!r}") from None
-    for name, value in found.items():
-        if not math.isfinite(value):
-            raise AVPError(f"{path}: expected a finite number for {name}, found {value}")
-    if "lpips" in found:
-        return found, None
-    weights = lpips_weights_path()
-    return found, "ns-eval's output says why" if weights.exists() else f"AlexNet's weights are not in {weights}"
 
 
 def lpips_weights_path() -> Path:

@@ -13,7 +13,7 @@ from avp_habitat.rollout.format import read_meta
 from avp_habitat.tracking import names, rollout_run
 from avp_habitat.tracking.deliver import finish
 from avp_habitat.tracking.experiments import find_run
-from avp_habitat.tracking.journal import Journal, journal_of, spool_folder
+from avp_habitat.tracking.journal import Journal, journal_of
 from avp_habitat.tracking.names import safe_name
 from avp_habitat.tracking.run import NewRun, TrackedRun, continue_run, join_run, may_continue, start_run
 from avp_habitat.tracking.stores import TrackingError, open_store
@@ -178,7 +178,7 @@ def _again(client: "MlflowClient | None", address: str, run_id: str) -> TrackedR
             return continue_run(address, run_id)
         return None
     # What it could not send while it lasted comes first; if its program was killed, that closes it.
-    left = journal_of(spool_folder(), run_id)
+    left = journal_of(run_id)
     journal = None if left is None else Journal.adopt(left)
     if journal is not None:
         finish(journal)

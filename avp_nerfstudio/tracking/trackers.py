@@ -17,8 +17,8 @@ from nerfstudio.utils.writer import EventName, Writer
 from numpy.typing import NDArray
 
 from avp_habitat.errors import UsageError
+from avp_habitat.files import check_new
 from avp_habitat.tracking.deliver import recover_in_background
-from avp_habitat.tracking.journal import spool_folder
 from avp_habitat.tracking.names import OFFLINE
 from avp_habitat.tracking.run import Status, TrackedRun
 from avp_habitat.tracking.stores import about_run
@@ -97,8 +97,7 @@ class ReconstructionRecording:
             UsageError: the file exists or cannot be written, or Rerun is not installed.
         """
         rr = _rerun()
-        if path.exists():
-            raise UsageError(f"--rerun {path}: exists already; choose another name or remove it")
+        check_new(path, option="--rerun")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch()
@@ -202,7 +201,7 @@ class Trackers:
         experiment, folder = config.mlflow_experiment, config.get_base_dir()
         self._run = run = open_run(address, facts_of(config), folder=folder, experiment=experiment, earlier=earlier)
         print(about_run(run.run_id, run.address, delivered=not run.run_id.startswith(OFFLINE)))
-        recover_in_background(spool_folder())
+        recover_in_background()
 
     def listen(self, every: int) -> None:
         """Take nerfstudio's numbers from now on, those of each iteration only `every` so many."""

@@ -5,16 +5,17 @@ import os
 import uuid
 import warnings
 import zipfile
+from collections.abc import Iterable
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from avp_habitat.errors import AVPError, UsageError
+from avp_habitat.errors import AVPError, UsageError, unknown_name
 from avp_habitat.files import atomic_file, check_writable
 from avp_habitat.policies.saved_model import statistics_names
-from avp_sb3.evaluation.policy import figure_of
+from avp_sb3.evaluation.policy import figures_of
 
 WHEN = "DATE-TIME"
 """In a file's name: replaced by when the training started."""
@@ -45,13 +46,21 @@ class BestModel:
         self._wanted = None if path is None else Path(path)
         self._score = score
 
-    def start(self, model: BaseAlgorithm) -> None:
+    def start(self, model: BaseAlgorithm, metrics: Iterable[Any] = ()) -> None:
         """Find the file's name, and go on from the file that is there when it is this training's own.
 
+        Args:
+            model: that trains.
+            metrics: of the user, as `TaskSettings.metrics`; the score may be one of them.
+
         Raises:
-            UsageError: the file is another training's, or this one's best by another score.
+            UsageError: there is no such score, or the file is another training's, or its best by another score.
             BestModelError: the folder cannot be written.
         """
+        known = figures_of(metrics)
+        if self._score not in known:
+            raise unknown_name("score", self._score, known)
+        self._lower = known[self._score].better == "lower"
         if not hasattr(model, _TRAINING):
             # From the system: the training's own random numbers stay as they are.
             setattr(model, _TRAINING, uuid.uuid4().hex)
@@ -82,8 +91,9 @@ class BestModel:
         return True
 
     def _is_better(self, value: float) -> bool:
-        less = figure_of(self._score).better == "lower"
-        return value == value and (self.value is None or (value < self.value if less else value > self.value))
+        if self.value is None or value != value:
+            return value == value
+        return value < self.value if self._lower else value > self.value
 
     def _path(self) -> Path:
         assert self._wanted is not None

@@ -9,15 +9,14 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Image, Logger
 from stable_baselines3.common.vec_env import VecEnv
 
-from avp_habitat.errors import UsageError, unknown_name
-from avp_habitat.metrics import FIGURES
+from avp_habitat.errors import UsageError
 from avp_habitat.simulators.registry import SimulatorChoice
 from avp_habitat.task.settings import TaskSettings
 from avp_sb3.callbacks.base import NOT_FOR, LoggedFile, MissingInfoError, is_learning, record
 from avp_sb3.callbacks.best_model import WHEN, BestModel, statistics_of
 from avp_sb3.evaluation.batch import READER, check_fit, means, own_random_state, run_batch, scenes_of
 from avp_sb3.evaluation.picture import evaluation_picture
-from avp_sb3.evaluation.policy import OF_CURVE, Episode
+from avp_sb3.evaluation.policy import Episode
 from avp_sb3.vec_env.batched import AVPVecEnv
 from avp_sb3.vec_env.subproc import AVPSubprocVecEnv
 
@@ -96,15 +95,12 @@ class EvaluationCallback(BaseCallback):
         for name, value in (("every", every), ("episodes", episodes)):
             if value < 1:
                 raise UsageError(f"{READER} {name}: expected at least 1, got {value}")
-        known = [*FIGURES, *(figure.name for figure in OF_CURVE), "return"]
-        if score not in known:
-            raise unknown_name("score", score, known)
         self._scenes = _scenes(scenes, eval_env, settings)
         self._given, self._env = eval_env, eval_env
         self._every, self._episodes, self._seed = every, episodes, seed
         self._deterministic, self._at_start, self._score = deterministic, at_start, score
         self._settings = settings
-        self._choice = SimulatorChoice(simulator, gpu=gpu, navmesh=navmesh and Path(navmesh), up=up)
+        self._choice = SimulatorChoice(simulator, gpu=gpu, navmesh=Path(navmesh) if navmesh else None, up=up)
         self._best = BestModel(best_model, score)
         self._due = 0
         self._evaluated_at: int | None = None
@@ -124,7 +120,8 @@ class EvaluationCallback(BaseCallback):
         with own_random_state(self.model, self._seed):
             self._env = self._open() if self._given is None else self._given
         check_fit(self.model, self.training_env, self._env)
-        self._best.start(self.model)
+        settings = self._env.get_attr("settings", 0)[0] if self._env.has_attr("settings") else None
+        self._best.start(self.model, settings.metrics if isinstance(settings, TaskSettings) else ())
         self._evaluated_at = None
         self._plan_next()
         _move_to_front(self, self.locals.get("callback"))

@@ -24,7 +24,6 @@ from avp_habitat.rollout.drawing import draw_trajectory
 from avp_habitat.rollout.images import write_rgb
 from avp_habitat.task.trajectory import Trajectory
 from avp_habitat.tracking.deliver import recover_in_background
-from avp_habitat.tracking.journal import spool_folder
 from avp_habitat.tracking.names import CONTINUED_TAG, KIND_TAG, RESUMED_TAG
 from avp_habitat.tracking.run import NewRun, Status, TrackedRun, continue_run, join_run, may_continue, start_run
 from avp_habitat.tracking.stores import DEFAULT_ADDRESS, about_run, shown
@@ -219,7 +218,7 @@ class MLflowCallback(BaseCallback):
         self._writer = MLflowWriter(run)
         self.logger.output_formats.append(self._writer)
         self._saved_at = time.monotonic()
-        recovery = recover_in_background(spool_folder())
+        recovery = recover_in_background()
         # The usual case, a store on this machine, is a matter of milliseconds; a slow server is not waited for.
         recovery.join(0.5)
         if self.verbose > 1:

@@ -1,6 +1,6 @@
 """Episodes of a policy on fixed starts, and the figures by which policies are compared."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat import metrics
-from avp_habitat.metrics import FIGURES, Figure
+from avp_habitat.metrics import FIGURES, Figure, figures
+from avp_habitat.plugins import name_of
 from avp_habitat.policies.registry import check_policy, make_policy, make_policy_env, steps_of
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.simulators.registry import make_simulator
@@ -18,22 +18,23 @@ from avp_habitat.task.trajectory import Trajectory
 
 COVERAGE_AFTER = (20, 40, 60, 80)
 """Views after which the coverage is a figure of its own, as far as the budget reaches."""
-OF_CURVE = (
+_OWN = (
     FIGURES["coverage_area"],
     *(Figure(f"coverage_at_{k}", f"coverage at {k} views", "%", 100, better="higher") for k in COVERAGE_AFTER),
+    Figure("return", "return", digits=3, better="higher"),
 )
-"""Figures of the whole budget."""
 RETURN = "return_"
 """Before the name of a reward's part in `info["avp_episode"]`."""
 
 
-def figure_of(name: str) -> Figure:
-    """How a figure of an episode is called and shown; one that the suite does not know, by its own name.
+def figures_of(metrics: Iterable[Any] = ()) -> dict[str, Figure]:
+    """All figures that an evaluation may have, by name, in the order in which tables show them.
 
     Args:
-        name: as in `Episode.figures`.
+        metrics: of the user, as `TaskSettings.metrics`.
     """
-    return {figure.name: figure for figure in OF_CURVE}.get(name) or metrics.figure_of(name)
+    known = figures(tuple(metrics))
+    return {"coverage": known["coverage"]} | {figure.name: figure for figure in _OWN} | known
 
 
 @dataclass(frozen=True)
@@ -57,14 +58,14 @@ def episode_of(coverage: Sequence[float], info: Mapping[str, Any], budget: int |
         info: of the last step.
         budget: T, at least v; None where it is not known. The figures of the whole curve are then left out.
     """
-    figures = {name: float(value) for name, value in info["avp_episode"].items() if not name.startswith(RETURN)}
-    if "redundant_views" in figures:
-        figures["redundant_share"] = figures.pop("redundant_views") / figures["views"]
-    curve = held_curve(coverage or [figures["coverage"]], budget or max(len(coverage), 1))
+    found = {name: float(value) for name, value in info["avp_episode"].items() if not name.startswith(RETURN)}
+    if "redundant_views" in found:
+        found["redundant_share"] = found.pop("redundant_views") / found["views"]
+    curve = held_curve(coverage or [found["coverage"]], budget or max(len(coverage), 1))
     if coverage and budget is not None:
-        figures["coverage_area"] = float(curve.mean())
-        figures |= {f"coverage_at_{k}": float(curve[k - 1]) for k in COVERAGE_AFTER if k <= budget}
-    return Episode(curve, figures, info.get("avp_trajectory"))
+        found["coverage_area"] = float(curve.mean())
+        found |= {f"coverage_at_{k}": float(curve[k - 1]) for k in COVERAGE_AFTER if k <= budget}
+    return Episode(curve, found, info.get("avp_trajectory"))
 
 
 def held_curve(values: Sequence[float], budget: int) -> NDArray[np.float64]:
@@ -144,12 +145,12 @@ class PolicyRunner:
     def result(self, episodes: Sequence[Episode], seed: int) -> PolicyResult:
         """At least one episode of this policy, stacked; the first one started from `seed`, the next from `seed + 1`."""
         return PolicyResult(
-            policy=self.name,
+            policy=name_of(self.name),
             seeds=seed + np.arange(len(episodes)),
             curve=np.stack([episode.curve for episode in episodes]),
             figures={name: np.array([each.figures[name] for each in episodes]) for name in episodes[0].figures},
             training_run=getattr(self._policy, "avp_mlflow_run_id", None),
-            observation=self.env.settings.observation,
+            observation=name_of(self.env.settings.observation),
         )
 
 

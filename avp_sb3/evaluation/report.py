@@ -4,7 +4,7 @@ import csv
 import json
 import os
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,9 @@ import numpy as np
 from avp_habitat import tables
 from avp_habitat.errors import AVPError
 from avp_habitat.files import atomic_folder
-from avp_habitat.metrics import CONFIDENCE, FIGURES, coverage_per_view, explained, mean_and_half_width
+from avp_habitat.metrics import CONFIDENCE, Figure, coverage_per_view, explained, mean_and_half_width
 from avp_habitat.provenance import git_commit, installed_versions
-from avp_sb3.evaluation.policy import OF_CURVE, PolicyResult, figure_of
+from avp_sb3.evaluation.policy import PolicyResult, figures_of
 
 JSON_FILE, CSV_FILE, TABLE_FILE, PLOT_FILE = "evaluation.json", "episodes.csv", "table.md", "coverage.png"
 FORMAT, FORMAT_VERSION = "avp-evaluation", 1
@@ -28,23 +28,29 @@ class ReportError(AVPError):
     """A report that cannot be written or read."""
 
 
-def table(results: Sequence[PolicyResult]) -> str:
-    """Figures by policy as a Markdown table: mean ± half the 95 % confidence interval; no ± for one episode."""
+def table(results: Sequence[PolicyResult], metrics: Iterable[Any] = ()) -> str:
+    """Figures by policy as a Markdown table: mean ± half the 95 % confidence interval; no ± for one episode.
+
+    Args:
+        results: of at least one policy.
+        metrics: of the user, as `TaskSettings.metrics`, that say how their figures are shown.
+    """
     head = ["figure", *(result.policy for result in results)]
-    return tables.table(head, [[name, *row] for name, row in cells(results).items()])
+    return tables.table(head, [[name, *row] for name, row in cells(results, metrics).items()])
 
 
-def cells(results: Sequence[PolicyResult]) -> dict[str, list[str]]:
-    """By the heading of a figure, its text for each policy."""
+def cells(results: Sequence[PolicyResult], metrics: Iterable[Any] = ()) -> dict[str, list[str]]:
+    """By the heading of a figure, its text for each policy; arguments as of `table`."""
     present = results[0].figures
-    order = ["coverage", *(figure.name for figure in OF_CURVE), *FIGURES, *present]
+    known = figures_of(metrics)
+    # Whoever reads a report may not have the metrics that its figures are of.
+    known |= {name: Figure(name, name, digits=3) for name in present if name not in known}
     shown = {
-        figure_of(name).heading: [
-            figure_of(name).text(*map(float, mean_and_half_width(result.figures[name]))) for result in results
-        ]
-        for name in sorted(present, key=order.index)
+        figure.heading: [figure.text(*map(float, mean_and_half_width(each.figures[name]))) for each in results]
+        for name, figure in known.items()
+        if name in present
     }
-    ratio = FIGURES["cpv"]
+    ratio = known["cpv"]
     episodes = [str(len(result.seeds)) for result in results]
     return shown | {ratio.heading: [ratio.text(cpv(result)) for result in results], "episodes": episodes}
 
@@ -60,13 +66,16 @@ def summary(result: PolicyResult) -> dict[str, dict[str, float | None]]:
     return {name: {"mean": _number(mean), "half_width": _number(half)} for name, (mean, half) in values.items()}
 
 
-def write_report(folder: Path, results: Sequence[PolicyResult], about: Mapping[str, Any]) -> Path:
+def write_report(
+    folder: Path, results: Sequence[PolicyResult], about: Mapping[str, Any], metrics: Iterable[Any] = ()
+) -> Path:
     """Write the folder; it appears only when it is whole.
 
     Args:
         folder: must not exist.
         results: of at least one policy.
         about: what was evaluated (command, scene, settings, …), as JSON; machine, commit and versions are added.
+        metrics: as of `table`.
 
     Raises:
         UsageError: the folder exists.
@@ -85,7 +94,7 @@ def write_report(folder: Path, results: Sequence[PolicyResult], about: Mapping[s
     with atomic_folder(folder, failure=ReportError, option="--out") as made:
         text = json.dumps(value, indent=2, allow_nan=False)
         (made / JSON_FILE).write_text(f"{text}\n", encoding="utf-8")
-        (made / TABLE_FILE).write_text(f"{table(results)}\n\n{LEGEND}\n", encoding="utf-8")
+        (made / TABLE_FILE).write_text(f"{table(results, metrics)}\n\n{LEGEND}\n", encoding="utf-8")
         _write_csv(made / CSV_FILE, results)
         _plot(made / PLOT_FILE, results)
     return folder
@@ -160,9 +169,9 @@ def _write_csv(path: Path, results: Sequence[PolicyResult]) -> None:
 
 def _plot(path: Path, results: Sequence[PolicyResult]) -> None:
     """Mean coverage by view with its confidence band."""
-    from matplotlib.figure import Figure
+    from matplotlib import figure
 
-    picture = Figure(figsize=(7, 4.5), layout="constrained")
+    picture = figure.Figure(figsize=(7, 4.5), layout="constrained")
     axes = picture.subplots()
     for result in results:
         mean, half = mean_and_half_width(100 * result.curve)

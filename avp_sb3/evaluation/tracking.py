@@ -3,7 +3,7 @@
 import os
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,7 @@ def track_evaluation(
     *,
     experiment: str | None,
     pictures: Mapping[str, NDArray[np.uint8]],
+    metrics: Iterable[Any] = (),
 ) -> tuple[str, str, str]:
     """Log an evaluation.
 
@@ -56,6 +57,7 @@ def track_evaluation(
         folder: of the report; its files become artifacts of the upper run.
         experiment: MLflow experiment, made when it does not exist; as `experiments.chosen_experiment` says when None.
         pictures: `(h, w, 3)` by policy, for those that have one.
+        metrics: as of `report.table`.
 
     Raises:
         ReportError: MLflow failed; the report is on disk.
@@ -69,7 +71,7 @@ def track_evaluation(
         client = connect(address)
         identity = experiment_id(client, *chosen_experiment(experiment))
         prepare_experiment(client, identity)
-        parent = _log(client, identity, results, about, folder, pictures)
+        parent = _log(client, identity, results, about, folder, pictures, cells(results, metrics))
         name = client.get_experiment(identity).name
     except (MlflowException, TrackingError, OSError) as error:
         raise ReportError(f"the report is in {folder}, but MLflow did not take it: {first_line(error)}") from error
@@ -83,6 +85,7 @@ def _log(
     about: Mapping[str, Any],
     folder: Path,
     pictures: Mapping[str, NDArray[np.uint8]],
+    shown: Mapping[str, list[str]],
 ) -> str:
     status = "FINISHED" if about["complete"] else "KILLED"
     scene = {"avp.scene": str(about["scene"]["name"]), "avp.scene_digest": str(about["scene"]["sha256"])}
@@ -103,7 +106,7 @@ def _log(
         if result.policy in pictures:
             client.log_image(run, pictures[result.policy], key="eval/trajectory", step=0)
         client.set_terminated(run, status)
-    columns = {"policy": names, **cells(results)}
+    columns = {"policy": names, **shown}
     client.log_table(parent, columns, TABLE)
     rows = zip(*(columns[heading] for heading in _NOTED), strict=True)
     note = f"{tables.table(_NOTED, list(rows))}\n\n{_TERMS}"

@@ -12,7 +12,7 @@ from PIL import Image
 
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout import images
-from avp_habitat.rollout.png import GREY_16
+from avp_habitat.rollout.images import GREY_16
 
 if TYPE_CHECKING:
     from avp_habitat.navigation.area import NavigableArea
@@ -41,7 +41,7 @@ class EncodedView:
 
 
 @dataclass(frozen=True)
-class Episode:
+class RecordedEpisode:
     """What a recording shows of t steps."""
 
     camera_to_world: NDArray[np.floating]
@@ -64,13 +64,13 @@ class Episode:
 
 def episode_of(
     trajectory: "Trajectory", area: "NavigableArea | None", intrinsics: Intrinsics, views: Mapping[int, EncodedView]
-) -> Episode:
+) -> RecordedEpisode:
     """The episode of an environment; without its area no floor is shown."""
     parts = {f"reward/{name}": values for name, values in trajectory.reward_parts.items()}
     floor: dict[str, Any] = {}
     if area is not None:
         floor = {"cells": np.asarray(area.centres), "first_seen": trajectory.first_seen, "cell_m": area.cell_m}
-    return Episode(
+    return RecordedEpisode(
         camera_to_world=trajectory.camera_to_world,
         path=np.concatenate([trajectory.start[None], trajectory.position]),
         intrinsics=intrinsics,
@@ -95,7 +95,7 @@ def spread_indices(count: int, at_most: int) -> list[int]:
 def log_episode(
     recording: rr.RecordingStream,
     root: str,
-    episode: Episode,
+    episode: RecordedEpisode,
     *,
     times: Mapping[str, Time],
     first_step: int = 0,
@@ -165,7 +165,7 @@ def _plot_path(root: str, name: str) -> str:
     return "/".join([root, "plots", *map(rr.escape_entity_path_part, name.split("/"))])
 
 
-def _log_scene(recording: rr.RecordingStream, root: str, episode: Episode) -> None:
+def _log_scene(recording: rr.RecordingStream, root: str, episode: RecordedEpisode) -> None:
     """What holds at all times."""
     world = f"{root}/world"
     recording.log(world, rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
@@ -181,7 +181,7 @@ def _log_scene(recording: rr.RecordingStream, root: str, episode: Episode) -> No
         recording.log(_plot_path(root, name), looks, static=True)
 
 
-def _floor_changes(episode: Episode) -> tuple[list[int], rr.ComponentColumnList]:
+def _floor_changes(episode: RecordedEpisode) -> tuple[list[int], rr.ComponentColumnList]:
     """The cells' colours at each step (from 0) that observed new ones; at fewer steps on large floors."""
     cells, seen = len(episode.cells), np.asarray(episode.first_seen)
     changes = [0, *sorted({int(step) - 1 for step in seen[seen > 0]} - {0})]
@@ -191,7 +191,7 @@ def _floor_changes(episode: Episode) -> tuple[list[int], rr.ComponentColumnList]
     return changes, rr.Points3D.columns(colors=colours.ravel()).partition([cells] * len(changes))
 
 
-def _send_views(recording: rr.RecordingStream, path: str, episode: Episode, times: list[rr.TimeColumn]) -> None:
+def _send_views(recording: rr.RecordingStream, path: str, episode: RecordedEpisode, times: list[rr.TimeColumn]) -> None:
     """The pictures, and where their camera stood."""
     steps = sorted(episode.views)
     views = [episode.views[step] for step in steps]
@@ -222,7 +222,7 @@ def _pinhole(intrinsics: Intrinsics, colour: tuple[int, int, int] | None = None)
     )
 
 
-def _pyramids(episode: Episode) -> NDArray[np.floating]:
+def _pyramids(episode: RecordedEpisode) -> NDArray[np.floating]:
     """`(t, 11, 3)` one line strip per viewpoint: the image's border and its edges to the camera centre."""
     camera = episode.intrinsics
     left, right = -camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx

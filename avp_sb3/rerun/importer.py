@@ -130,7 +130,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--recording-id", help="recording to add to")
     parser.add_argument("--opened-recording-id", help="recording on show")
     parser.add_argument("--entity-path-prefix", default="", help="entity path above all that is added")
-    text = "NAME=NUMBER: a further time line with the value that it has throughout"
+    pairs = {"type": _named_number, "action": "append", "default": [], "metavar": "NAME=NUMBER"}
     for flag in ("--time_sequence", "--time_duration_nanos", "--time_timestamp_nanos", "--sequence"):
-        parser.add_argument(flag, type=_named_number, action="append", default=[], help=text)
+        parser.add_argument(flag, help="a further time line with the value that it has throughout", **pairs)
     return parser.parse_known_args(argv)[0]

@@ -21,7 +21,7 @@ from avp_habitat.task.settings import ACTION_NAMES
 from avp_sb3.rerun import APPLICATION
 from avp_sb3.rerun.episode import (
     EncodedView,
-    Episode,
+    RecordedEpisode,
     Time,
     encode_view,
     log_at,
@@ -43,7 +43,7 @@ _COLOURS = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (213, 94, 0), (204, 121
 class RolloutContents:
     """What a recording shows of a rollout besides its `rollout.json`."""
 
-    episode: Episode
+    episode: RecordedEpisode
     """Its steps and pictures."""
     room: Cloud
     """Out of the pictures."""
@@ -82,7 +82,7 @@ def read_contents(rollout: Rollout, *, pictures: int = _PICTURES) -> RolloutCont
     picture = rollout.folder / "trajectory.png"
     if drawn := picture.exists():
         images.read_rgb(picture)
-    episode = Episode(poses, feet, camera, views, plots)
+    episode = RecordedEpisode(poses, feet, camera, views, plots)
     return RolloutContents(episode, room, picture.read_bytes() if drawn else None)
 
 

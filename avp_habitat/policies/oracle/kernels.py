@@ -160,16 +160,13 @@ def look(parent, place, pose, camera, sees, points, seen):
 
 
 @njit(cache=True)
-def outlook(parent, place, yaw, seen, fresh, wanted, reach, heading, near_turn, far_turn, left, pace):
+def outlook(place, yaw, unseen, reach, heading, near_turn, far_turn, left, pace):
     """`(n,)` what the cells not yet seen can still bring: for each, the views left once it could be in sight.
 
     Args:
-        parent: `(n,)` row of `seen`.
-        place: `(n,)` number of a place.
+        place: `(n,)` numbers of places.
         yaw: `(n,)` uint8, 256ths of a turn.
-        seen: `(k, words)` cells seen before.
-        fresh: `(n, words)` cells seen by the candidate view.
-        wanted: `(words,)` cells that can be seen at all.
+        unseen: `(n, words)` cells that can be seen at all and were not.
         reach: `(p, m)` of `reach_tables`.
         heading: `(p, m)` of `reach_tables`.
         near_turn: `(256,)` steps of turning until a cell at this difference of heading is in the image.
@@ -177,36 +174,30 @@ def outlook(parent, place, yaw, seen, fresh, wanted, reach, heading, near_turn, 
         left: views left after the candidate's.
         pace: steps counted for each step of the shortest way, because one walk cannot serve all cells.
     """
-    result = np.zeros(len(parent), np.float64)
-    for i in range(len(parent)):
-        at, total = place[i], 0.0
-        for k in range(len(wanted)):
-            word = wanted[k] & ~seen[parent[i], k] & ~fresh[i, k]
+    result = np.zeros(len(place), np.float64)
+    for i in range(len(place)):
+        at = place[i]
+        for k in range(unseen.shape[1]):
+            word = unseen[i, k]
             while word:
-                bit = lowest(word)
+                cell = 64 * k + lowest(word)
                 word &= word - ONE
-                half = reach[at, 64 * k + bit]
-                if half == NEVER:
-                    continue
-                turn = (int(heading[at, 64 * k + bit]) - int(yaw[i])) & 255
-                steps = 1.0 + 0.5 * half + (near_turn[turn] if half == 0 else far_turn[turn])
-                value = left - pace * steps
-                if value > 0:
-                    total += value
-        result[i] = total
+                half = reach[at, cell]
+                if half != NEVER:
+                    turn = (int(heading[at, cell]) - int(yaw[i])) & 255
+                    steps = 1.0 + 0.5 * half + (near_turn[turn] if half == 0 else far_turn[turn])
+                    result[i] += max(left - pace * steps, 0.0)
     return result
 
 
 @njit(cache=True)
-def choose(order, key, parent, seen, fresh, width, per_key):
+def choose(order, key, seen, width, per_key):
     """Rows of the best candidates: at most `per_key` of one key, never two of one key that have seen the same.
 
     Args:
         order: `(n,)` rows, the best first.
         key: `(n,)` where a candidate stands and looks.
-        parent: `(n,)` row of `seen`.
-        seen: `(k, words)` cells seen before.
-        fresh: `(n, words)` cells seen by the candidate view.
+        seen: `(n, words)` cells that it has seen.
         width: largest number to keep.
         per_key: largest number to keep of one key.
     """
@@ -216,8 +207,8 @@ def choose(order, key, parent, seen, fresh, width, per_key):
         if used.get(key[i], 0) >= per_key:
             continue
         digest = np.uint64(key[i])
-        for k in range(fresh.shape[1]):
-            digest = (digest ^ (seen[parent[i], k] | fresh[i, k])) * np.uint64(0x9E3779B97F4A7C15)
+        for word in seen[i]:
+            digest = (digest ^ word) * np.uint64(0x9E3779B97F4A7C15)
             digest ^= digest >> np.uint64(29)
         if digest in states:
             continue

@@ -116,8 +116,7 @@ def make_places(
         simulator: of the scene.
         settings: of the task: sensor height, range, tolerance, length of a move.
         surfaces: whether points on other surfaces count like floor cells once they are seen from near.
-        entries: most pairs of a place and a cell; their spacing is the smallest multiple of a cell that
-            keeps below.
+        entries: most pairs of a place and a cell; their spacing is the smallest multiple of a cell that keeps below.
     """
     area = simulator.area
     points = area.centres
@@ -133,23 +132,15 @@ def make_places(
     grid[tuple(np.argwhere(area.mask)[cells].T)] = np.arange(len(cells))
     other, length = kernels.neighbour_table(np.ascontiguousarray(grid[::stride, ::stride]), len(cells))
     spacing = stride * area.cell_m
-    reach, heading = kernels.reach_tables(
-        sees,
-        points,
-        places,
-        other,
-        length,
-        spacing / kernels.LENGTHS_PER_SPACING / settings.forward_m,
-        max(1, round(_AHEAD_M / spacing)),
-        _NEAR_M,
-    )
-    wanted = np.bitwise_or.reduce(sees, axis=0)
+    unit_m, ahead = spacing / kernels.LENGTHS_PER_SPACING, max(1, round(_AHEAD_M / spacing))
+    steps = unit_m / settings.forward_m
+    reach, heading = kernels.reach_tables(sees, points, places, other, length, steps, ahead, _NEAR_M)
     return ScenePlaces(
         area=area,
         position=places,
         points=points,
         sees=sees,
-        wanted=wanted,
+        wanted=np.bitwise_or.reduce(sees, axis=0),
         reach=reach,
         heading=heading,
         neighbours=other,
@@ -180,12 +171,7 @@ def _unhidden(simulator: Simulator, places: Float, points: Float, range_m: Float
 
 
 def surface_points(simulator: Simulator, settings: TaskSettings) -> NDArray[np.float64]:
-    """`(k, 3)` points on the surfaces seen from all over the floor, without the floor itself, metres.
-
-    Args:
-        simulator: of the scene.
-        settings: of the task: sensor height and range.
-    """
+    """`(k, 3)` points on the surfaces seen from all over the floor, without the floor itself, metres."""
     seen = []
     for view in views_all_over(simulator, settings):
         points = view.points[view.hit]

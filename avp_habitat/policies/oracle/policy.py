@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,6 @@ from avp_habitat.sight.bits import pack
 from avp_habitat.sight.rules import candidates
 from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.motion import act, sensor_poses
-from avp_habitat.task.settings import TaskSettings
 
 
 @dataclass(frozen=True)
@@ -28,59 +28,34 @@ class Plan:
     """`(T,)` coverage C after each view (Eq. 17)."""
 
 
-def make_plan(view: AgentView, beam: BeamSettings | None = None) -> Plan:
+def make_plan(view: AgentView, *, surfaces: bool = False, beam: BeamSettings | None = None) -> Plan:
     """Plan the rest of an agent's episode with full knowledge of the scene.
-
-    Two plans are made: a tour of a greedy set cover, and a beam search over action sequences. The one with the larger
-    mean coverage over its views is returned.
 
     Args:
         view: the agent now; at the start of an episode all views are left.
+        surfaces: plan to see every surface, not the floor alone, by a beam search over action sequences; surfaces other
+            than the floor count as not yet seen. Without it, the tour of a greedy set cover is planned too, and the
+            plan with the larger mean coverage over its views is returned.
         beam: width of the search.
 
     Raises:
         UsageError: the task does not count visible cells.
     """
     settings = view.settings
-    _check_mode("oracle", settings)
-    views = settings.budget - view.steps
-    places = scene_places(view.simulator, settings)
-    start = start_state(view.position, pack(view.observed[None])[0], yaw=view.yaw, pitch=view.pitch)
-    tour = covering_tour(places, settings, start, views)
-    found = beam_search(places, settings, start, views, beam or BeamSettings())
-    plans = [Plan(actions, planned_coverage(view, actions)) for actions in (tour, found)]
-    return max(plans, key=lambda plan: plan.coverage.sum())
-
-
-def make_survey(view: AgentView, beam: BeamSettings | None = None) -> Plan:
-    """Plan the rest of an agent's episode so that every surface is seen, not the floor alone.
-
-    The beam search of the oracle, with points on walls, furniture and ceiling beside the floor's cells. An episode that
-    is under way counts surfaces other than the floor as not yet seen.
-
-    Args:
-        view: the agent now.
-        beam: width of the search.
-
-    Raises:
-        UsageError: the task does not count visible cells.
-    """
-    settings = view.settings
-    _check_mode("survey", settings)
-    places = scene_places(view.simulator, settings, surfaces=True)
+    if settings.coverage_mode != "visible":
+        raise UsageError(
+            f"policy {'survey' if surfaces else 'oracle'}: plans for coverage_mode 'visible', got "
+            f"{settings.coverage_mode!r}; choose another policy"
+        )
+    places = scene_places(view.simulator, settings, surfaces=surfaces)
     seen = np.zeros(len(places.points), dtype=np.bool_)
     seen[: len(view.observed)] = view.observed
     start = start_state(view.position, pack(seen[None])[0], yaw=view.yaw, pitch=view.pitch)
     views = settings.budget - view.steps
-    actions = beam_search(places, settings, start, views, beam or BeamSettings(width=300))
-    return Plan(actions, planned_coverage(view, actions))
-
-
-def _check_mode(policy: str, settings: TaskSettings) -> None:
-    if settings.coverage_mode != "visible":
-        raise UsageError(
-            f"policy {policy}: plans for coverage_mode 'visible', got {settings.coverage_mode!r}; choose another policy"
-        )
+    found = [] if surfaces else [covering_tour(places, settings, start, views)]
+    found.append(beam_search(places, settings, start, views, beam or BeamSettings(width=300 if surfaces else 1000)))
+    plans = [Plan(actions, planned_coverage(view, actions)) for actions in found]
+    return max(plans, key=lambda plan: plan.coverage.sum())
 
 
 def planned_coverage(view: AgentView, actions: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -126,6 +101,8 @@ class OraclePolicy(PlanningPolicy):
     It prepares each scene once and then plans for each episode; it never stops before the budget ends.
     """
 
+    surfaces = False
+
     def __init__(
         self, views: Callable[[], list[AgentView]], seed: int | None = None, *, beam: BeamSettings | None = None
     ) -> None:
@@ -135,12 +112,10 @@ class OraclePolicy(PlanningPolicy):
 
     def make_planner(self, rng: np.random.Generator) -> OraclePlanner:
         """For one episode; nothing is drawn at random."""
-        return OraclePlanner(lambda view: make_plan(view, self.beam))
+        return OraclePlanner(partial(make_plan, surfaces=self.surfaces, beam=self.beam))
 
 
 class SurveyPolicy(OraclePolicy):
     """`survey`: the oracle for reconstruction, which plans to see every surface of the scene, not the floor alone."""
 
-    def make_planner(self, rng: np.random.Generator) -> OraclePlanner:
-        """For one episode; nothing is drawn at random."""
-        return OraclePlanner(lambda view: make_survey(view, self.beam))
+    surfaces = True

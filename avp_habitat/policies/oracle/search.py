@@ -66,7 +66,7 @@ def beam_search(
         settings: of the task.
         start: one state.
         views: number of actions.
-        beam: width and hope.
+        beam: how widely to search.
 
     Returns:
         `(views,)` actions; never stop.
@@ -91,28 +91,17 @@ def _advance(
     place = places.nearest(position)
     fresh, gain = new_views(places, settings, parent, position, yaw, pitch, states.seen)
     value = states.value[parent] + (left + 1) * gain
-    near_turn, far_turn = _turning(settings)
+    heading = (np.round(yaw / (2 * np.pi) * 256).astype(np.int64) & 255).astype(np.uint8)
+    seen = states.seen[parent] | fresh
     hope = kernels.outlook(
-        parent,
-        place,
-        _in_256ths(yaw),
-        states.seen,
-        fresh,
-        places.wanted,
-        places.reach,
-        places.heading,
-        near_turn,
-        far_turn,
-        left,
-        beam.pace,
+        place, heading, places.wanted & ~seen, places.reach, places.heading, *_turning(settings), left, beam.pace
     )
     turn = np.round(wrap_angle(yaw) / np.radians(settings.turn_deg)).astype(np.int64)
     tilt = np.round(pitch / np.radians(settings.tilt_deg)).astype(np.int64)
     key = 1 + (place * 4096 + turn + 2048) * 4096 + tilt + 2048
     order = np.argsort(-(value + hope), kind="stable")
-    kept = kernels.choose(order, key, parent, states.seen, fresh, beam.width, beam.per_key)
-    seen = states.seen[parent[kept]] | fresh[kept]
-    return States(position[kept], yaw[kept], pitch[kept], seen, value[kept]), parent[kept], action[kept]
+    kept = kernels.choose(order, key, seen, beam.width, beam.per_key)
+    return States(position[kept], yaw[kept], pitch[kept], seen[kept], value[kept]), parent[kept], action[kept]
 
 
 def _moved(
@@ -127,10 +116,6 @@ def _moved(
     parent, action = parent[useful], action[useful]
     moved = act(area, settings, action, states.position[parent], states.yaw[parent], states.pitch[parent])
     return parent, action, *moved
-
-
-def _in_256ths(yaw: Float) -> NDArray[np.uint8]:
-    return (np.round(yaw / (2 * np.pi) * 256).astype(np.int64) & 255).astype(np.uint8)
 
 
 def _turning(settings: TaskSettings) -> tuple[Float, Float]:

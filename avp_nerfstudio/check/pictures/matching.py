@@ -15,7 +15,7 @@ from tqdm import tqdm
 from avp_habitat import command
 from avp_habitat.errors import RolloutError
 from avp_habitat.rollout.format import Rollout
-from avp_habitat.rollout.png import check_png_contents
+from avp_habitat.rollout.images import check_png_contents
 
 # Longer rollouts are judged by runs of neighbouring frames, spread evenly over the walk.
 MAX_FRAMES = 240

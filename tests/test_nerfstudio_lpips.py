@@ -1,4 +1,3 @@
-import json
 import time
 
 import pytest
@@ -6,43 +5,7 @@ import torch
 
 pytest.importorskip("nerfstudio")
 
-from avp_habitat.errors import AVPError
-from avp_nerfstudio.method.scores import OptionalLPIPS, lpips_weights_path, read_scores
-
-
-def write(path, results):
-    path.write_text(json.dumps({"method_name": "avp-nerfacto", "results": results}))
-    return path
-
-
-def test_the_scores_of_ns_eval_are_read_and_lpips_may_be_missing(tmp_path, monkeypatch):
-    path = write(tmp_path / "s.json", {"psnr": 25.5, "psnr_std": 2, "ssim": 0.9, "lpips": 0.04, "fps": 1.0})
-    assert read_scores(path) == ({"psnr": 25.5, "ssim": 0.9, "lpips": 0.04}, None)
-    write(path, {"psnr": 25.5, "ssim": 0.9})
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    assert read_scores(path) == ({"psnr": 25.5, "ssim": 0.9}, f"AlexNet's weights are not in {lpips_weights_path()}")
-    lpips_weights_path().parent.mkdir(parents=True)
-    lpips_weights_path().touch()
-    assert "output says why" in str(read_scores(path)[1])
-
-
-@pytest.mark.parametrize(
-    ("content", "text"),
-    [
-        (None, "FileNotFoundError"),
-        ("{", "JSONDecodeError"),
-        ('{"results": 3}', "TypeError"),
-        ('{"results": {"psnr": 20}}', "KeyError.*ssim"),
-        ('{"results": {"psnr": NaN, "ssim": 1}}', "finite number for psnr, found nan"),
-    ],
-)
-def test_a_file_that_is_not_ns_evals_is_an_error_that_names_it(tmp_path, content, text):
-    path = tmp_path / "s.json"
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(AVPError, match=text) as error:
-        read_scores(path)
-    assert str(path) in str(error.value)
+from avp_nerfstudio.method.scores import OptionalLPIPS
 
 
 @pytest.fixture
