@@ -48,7 +48,8 @@ def in_image(right, up, ahead, camera):
 def in_view(pose, point, camera, max_range):
     """Whether a point lies inside the image and within range: distance to the camera, not planar depth."""
     right, up, ahead = in_camera(pose, point)
-    return right * right + up * up + ahead * ahead <= max_range * max_range and in_image(right, up, ahead, camera)
+    in_range = right * right + up * up + ahead * ahead <= max_range * max_range
+    return ahead > 0 and in_range and in_image(right, up, ahead, camera)
 
 
 @njit(cache=True)
