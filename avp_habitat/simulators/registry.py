@@ -59,6 +59,11 @@ class SimulatorChoice:
 
     def __post_init__(self) -> None:
         """Refuse what cannot work."""
+        factory = self.factory
+        if not callable(factory):
+            raise UsageError(
+                f"simulator {self.name!r}: expected a factory of (scene, gpu, navmesh, up), got {factory!r}"
+            )
         if self.navmesh is not None:
             object.__setattr__(self, "navmesh", Path(self.navmesh))
         if self.up not in (None, *UPS):
@@ -66,8 +71,8 @@ class SimulatorChoice:
         if self.gpu is not None and (isinstance(self.gpu, bool) or not isinstance(self.gpu, int) or self.gpu < -1):
             raise UsageError(f"gpu: expected a CUDA device from 0, or -1 for none, got {self.gpu!r}")
         for option in self.options:
-            if not _takes(self.factory, option):
-                able = " or ".join(repr(name) for name, factory in SIMULATORS.items() if _takes(factory, option))
+            if not _takes(factory, option):
+                able = " or ".join(repr(name) for name, known in SIMULATORS.items() if _takes(known, option))
                 chosen = f"but {self.name!r} was chosen; leave it out, or choose {able}"
                 raise UsageError(f"{option}: is of the simulator {able}, {chosen}")
 
