@@ -38,6 +38,7 @@ def _habitat(scene: str, *, gpu: int | None = None, navmesh: Path | None = None,
 SIMULATORS: dict[str, Factory] = {"raycast": _raycast, "habitat": _habitat}
 """What is built in, by name."""
 _OPTIONS = ("gpu", "navmesh", "up")
+_EXPECTED = "expected a factory of (scene, gpu, navmesh, up)"
 
 
 @dataclass(frozen=True)
