@@ -62,9 +62,7 @@ class SimulatorChoice:
         """Refuse what cannot work."""
         factory = self.factory
         if not callable(factory):
-            raise UsageError(
-                f"simulator {self.name!r}: expected a factory of (scene, gpu, navmesh, up), got {factory!r}"
-            )
+            raise UsageError(f"simulator {self.name!r}: {_EXPECTED}, got {factory!r}")
         if self.navmesh is not None:
             object.__setattr__(self, "navmesh", Path(self.navmesh))
         if self.up not in (None, *UPS):
@@ -169,9 +167,7 @@ def _opened(choice: SimulatorChoice, scene: str) -> Simulator:
     try:
         inspect.signature(choice.factory).bind(scene, **choice.options)
     except TypeError as error:
-        raise UsageError(
-            f"simulator {choice.name!r}: expected a factory of (scene, gpu, navmesh, up): {error}"
-        ) from None
+        raise UsageError(f"simulator {choice.name!r}: {_EXPECTED}: {error}") from None
     simulator = choice.factory(scene, **choice.options)
     if missing := [each for each in ASKED if each not in dir(simulator)]:
         raise UsageError(f"simulator {choice.name!r}: {type(simulator).__name__} has no {', '.join(missing)}")
