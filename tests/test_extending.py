@@ -330,6 +330,10 @@ def test_what_is_no_simulator_is_one_line(users, capsys, tmp_path):
         UsageError, match=r"navmesh: is of the simulator 'raycast' or 'habitat', but 'users_module:made'"
     ):
         SimulatorChoice("users_module:made", navmesh=Path("a.navmesh"))
+    with pytest.raises(UsageError, match=r"simulator 'users_module:number': expected a factory of .*, got 3"):
+        SimulatorChoice("users_module:number")
+    with pytest.raises(UsageError, match=r"unknown simulator 'raycats': .* did you mean 'raycast'"):
+        SimulatorChoice("raycats")
     words = ["--scene", "a", "--policy", "random", "--simulator", "users_modul:made", "--out", "r"]
     assert command.run(collect, words) == 2
     assert capsys.readouterr().err.count("\n") == 1
