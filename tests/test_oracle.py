@@ -140,8 +140,8 @@ def test_reach_counts_the_steps_around_the_wall(corridor):
 def test_few_table_entries_give_a_coarser_grid_of_places_in_the_same_scene(corridor):
     task = TaskSettings()
     fine, coarse = make_places(corridor, task), make_places(corridor, task, entries=200_000)
-    assert len(coarse.places) * len(coarse.points) <= 200_000 < len(fine.places) * len(fine.points)
-    assert set(map(tuple, coarse.places)) <= set(map(tuple, fine.places))
+    assert len(coarse.position) * len(coarse.points) <= 200_000 < len(fine.position) * len(fine.points)
+    assert set(map(tuple, coarse.position)) <= set(map(tuple, fine.position))
     assert unpack(coarse.wanted[None], len(coarse.points)).all()
 
 

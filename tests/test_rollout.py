@@ -307,7 +307,7 @@ DAMAGES = {
         r"\.\./floor.png: expected a path inside",
     ),
     "floor cut short": (lambda f: cut_short(f, "floor.png"), "floor.png: .* without an end"),
-    "floor damaged": (lambda f: flip_byte(f / "floor.png", 60), "floor.png: .* does not match its checksum"),
+    "floor damaged": (lambda f: flip_byte(f / "floor.png", 60), "floor.png: expected an undamaged PNG"),
     "floor of another size": (
         lambda f: edit_json(f / "rollout.json", lambda j: j["floor"].update(shape=[4, 3])),
         "floor.png: expected 3x4 pixels .*found 4x3",
@@ -353,23 +353,14 @@ def test_links_are_followed_within_the_folder_and_into_a_store(rollout):
     assert len(read_rollout(rollout).frames) == FRAMES
 
 
-@pytest.mark.parametrize("position", [20, 60, -20])
+@pytest.mark.parametrize("position", [20, 33, 60, -20])
 def test_any_damaged_byte_of_a_picture_is_found_by_its_checksums(rollout, position):
     path = rollout / "images/frame_00000.png"
     check_png_contents(path)
     content = bytearray(path.read_bytes())
     content[position] ^= 1
     path.write_bytes(content)
-    with pytest.raises(RolloutError, match=r"frame_00000\.png: expected .* (IHDR|IDAT) .*does not match its checksum"):
-        check_png_contents(path)
-
-
-def test_a_chunk_longer_than_the_file_is_found(rollout):
-    path = rollout / "images/frame_00000.png"
-    content = bytearray(path.read_bytes())
-    content[33] = 0x7F
-    path.write_bytes(content)
-    with pytest.raises(RolloutError, match="part at byte 33 is longer than the file"):
+    with pytest.raises(RolloutError, match=r"frame_00000\.png: expected an undamaged PNG"):
         check_png_contents(path)
 
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rerun as rr
-from avp_habitat.rollout.png import GREY_16
 from numpy.typing import NDArray
 from PIL import Image
 
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout import images
+from avp_habitat.rollout.images import GREY_16
 
 if TYPE_CHECKING:
     from avp_habitat.navigation.area import NavigableArea
