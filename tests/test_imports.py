@@ -21,8 +21,6 @@ LIGHT = (
     "plugins",
     "poses",
     "ranges",
-    "rollout.format",
-    "rollout.images",
     "task.rewards",
     "task.trajectory",
 )
