@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from avp_experiment.configuration import TRAIN as TRAIN_SCENE
 from avp_experiment.configuration import Configuration, Method, Scene, scene_slug
 from avp_habitat.errors import AVPError
@@ -24,8 +22,7 @@ _START_SEEDS = 1000
 _SURFACE_OBSERVATION = {"map": "surface_map"}
 """What a policy whose reward needs the surface observes instead."""
 _CURVES = ("avp/cpv", "avp/coverage", "avp/views", "rollout/ep_rew_mean")
-"""Metrics of a training whose course is kept, as at most `_POINTS` points."""
-_POINTS = 400
+"""Metrics of a training whose course is kept."""
 
 
 @dataclass(frozen=True)
@@ -167,9 +164,7 @@ def _curves(client: Any, run_id: str) -> dict[str, list[list[float]]]:
             found = {point.step: point.value for point in client.get_metric_history(run_id, metric)}
         except MlflowException:
             continue
-        steps = sorted(found)
-        kept = np.unique(np.linspace(0, len(steps) - 1, min(len(steps), _POINTS)).astype(int)) if steps else []
-        curves[metric] = [[steps[i], round(found[steps[i]], 6)] for i in kept]
+        curves[metric] = [[step, round(found[step], 6)] for step in sorted(found)]
     return curves
 
 

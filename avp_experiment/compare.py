@@ -94,13 +94,7 @@ def _number(option: str, text: str, auto: int) -> int:
 
 
 def compare(configuration: Configuration, out: Path, *, jobs: int, line: str) -> None:
-    """Do what is left, then write tables and figures and log them.
-
-    Args:
-        configuration: of the experiment.
-        out: its folder.
-        jobs: cells at a time.
-        line: the command, for the results and for going on after an interruption.
+    """Do what is left, `jobs` cells at a time, then write tables and figures and log them with the command's line.
 
     Raises:
         AVPError: the folder cannot be used, or some cells failed; the others are done then.

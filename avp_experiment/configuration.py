@@ -7,7 +7,6 @@ from typing import Any
 
 from avp_habitat import plugins
 from avp_habitat.errors import UsageError, unknown_name
-from avp_habitat.policies.registry import POLICIES
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.task.rewards import REWARDS
 
@@ -42,6 +41,8 @@ class Method:
 
 def known_methods() -> dict[str, Method]:
     """By name: policies, rewards, rewards trained in rooms; also those that other distributions register."""
+    from avp_habitat.policies.registry import POLICIES
+
     rewards = plugins.names("avp.rewards", REWARDS)
     methods = [Method(name) for name in plugins.names("avp.policies", POLICIES)]
     methods += [Method(reward, learned=True, in_rooms=rooms) for rooms in (False, True) for reward in rewards]
@@ -77,7 +78,7 @@ def chosen_methods(names: Sequence[str]) -> tuple[Method, ...]:
 
 def _placed(name: str) -> Method:
     spec = name.removesuffix(ROOMS)
-    learned = not hasattr(plugins.find("avp.policies", spec, POLICIES), "predict")
+    learned = not hasattr(plugins.find("avp.policies", spec, {}), "predict")
     return Method(spec, learned, in_rooms=learned and name != spec)
 
 

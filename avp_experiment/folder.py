@@ -13,7 +13,6 @@ from avp_experiment.cells import COLLECT, RECONSTRUCT, TRAIN, Cell
 from avp_experiment.configuration import Configuration
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.files import atomic_file
-from avp_habitat.rollout.capture import VIEWS
 
 FORMAT = 1
 CONFIGURATION = "experiment.json"
@@ -162,6 +161,8 @@ def _known(path: Path) -> dict[str, Any]:
 
 def _bytes_needed(cells: Sequence[Cell], configuration: Configuration) -> int:
     """About how much disk cells take; measured: a picture with its depth takes up to 3.5 bytes per pixel."""
+    from avp_habitat.rollout.capture import VIEWS
+
     width, height = configuration.preset.size
     rollout = 7 * width * height * (configuration.preset.budget + VIEWS) // 2
     size = {TRAIN: 8 * _MB, COLLECT: rollout, RECONSTRUCT: _MB}

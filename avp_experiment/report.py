@@ -1,11 +1,10 @@
 """`python -m avp_experiment.report`: every table and figure of an experiment, and the page that holds them."""
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from tyro.conf import Positional
 
@@ -35,14 +34,7 @@ _SETTINGS = ("seeds", "starts", "budget", "observation", "steps", "steps_rooms",
 
 
 def write_report(folder: Path, *, shown_maps: Sequence[str] = DEFAULT_MAPS) -> Path:
-    """Write tables, figures, claims and the page that holds them.
-
-    Args:
-        folder: of the experiment, with `results.json`.
-        shown_maps: methods of figure 5.
-
-    Returns:
-        The page.
+    """Write tables, figures (5 of some methods), claims and the page that holds them; gives the page.
 
     Raises:
         UsageError: no such folder.
@@ -119,25 +111,22 @@ def _below(text: str) -> str:
 
 def _origin(results: Results) -> str:
     origin, configuration = results.origin, results.configuration
+    machine = origin["machine"] | {"gpu": origin["machine"]["gpu"] or "no GPU"}
     settings = ", ".join(f"{name} {configuration[name]}" for name in _SETTINGS if name in configuration)
     about = {
-        "command": f"`{origin.get('command', 'not known')}`",
+        "command": f"`{origin['command']}`",
         "preset": f"{configuration.get('preset', 'not known')}: {settings}",
         "scenes": ", ".join(f"{scene['name']} ({scene['role']})" for scene in configuration["scenes"]),
-        "commits": ", ".join(f"`{commit[:12]}`" for commit in origin.get("commits") or []) or "not known",
-        "machine": _machine(origin.get("machine") or {}),
-        "versions": ", ".join(f"{name} {version}" for name, version in (origin.get("versions") or {}).items()),
-        "finished": f"{origin.get('finished', 'not known')}, {origin.get('hours', '?')} hours of work in all cells",
+        "commits": ", ".join(f"`{commit[:12]}`" for commit in origin["commits"]) or "not known",
+        "machine": "{platform}, {processor}, {cores} cores, {gpu}".format(
+            **machine | {"gpu": machine["gpu"] or "no GPU"}
+        ),
+        "versions": ", ".join(f"{name} {version}" for name, version in origin["versions"].items()),
+        "finished": f"{origin['finished']}, {origin['hours']} hours of work in all cells",
         "failed cells": str(len(results.failed)) + (" (see below)" if results.failed else ""),
     }
     made = f"Made from [`{FILE}`]({FILE}) by `python -m avp_experiment.report FOLDER`; data and settings are all in it."
     return "\n".join([made, "", *(f"- {name}: {value}" for name, value in about.items())])
-
-
-def _machine(machine: Mapping[str, Any]) -> str:
-    cores = f"{machine['cores']} cores" if machine.get("cores") else None
-    words = (machine.get("platform"), machine.get("processor"), cores, machine.get("gpu") or "no GPU")
-    return ", ".join(str(word) for word in words if word)
 
 
 @dataclass(frozen=True)

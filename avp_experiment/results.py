@@ -214,11 +214,12 @@ def _reconstruction(entry: Any) -> Reconstruction:
     )
 
 
+_ORIGIN = ("command", "commits", "machine", "versions", "finished", "hours")
 _PARTS: dict[str, Callable[[Any], Any]] = {
     "configuration": _configuration,
     "methods": tuple,
     "figures": lambda entries: {name: Figure(**entry) for name, entry in entries.items()},
-    "origin": dict,
+    "origin": lambda entry: {name: entry[name] for name in _ORIGIN},
     "training": lambda entries: tuple(map(_training, entries)),
     "rollouts": lambda entries: tuple(map(_episode, entries)),
     "reconstructions": lambda entries: tuple(map(_reconstruction, entries)),
@@ -228,17 +229,7 @@ _PARTS: dict[str, Callable[[Any], Any]] = {
 
 
 def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], *, command: str) -> dict[str, Any]:
-    """Write `results.json` (docs/experiment.md describes it) of what is done by now, with pictures beside it.
-
-    Args:
-        configuration: of the experiment.
-        folder: of the experiment.
-        cells: all of them.
-        command: that was typed.
-
-    Returns:
-        The content.
-    """
+    """Write `results.json` (docs/experiment.md describes it) of what is done by now, with pictures; its content."""
     done = [(cell, record) for cell in cells if (record := folder.record(cell)) is not None]
     known = figures(configuration.metrics)
     measured = {name for cell, record in done if cell.kind == COLLECT for name in record["facts"]["metrics"]}

@@ -55,11 +55,7 @@ class Runner:
     """Reasons by the cell's key."""
 
     def run(self, cells: Sequence[Cell]) -> None:
-        """Do all cells that are not done; those that fail, and those that need them, are passed over.
-
-        Args:
-            cells: each after the one that it needs.
-        """
+        """Do all cells that are not done; those that fail, and those that need them, are passed over."""
         # Libraries read these when they are loaded, which is in the process from which cells are forked: with two
         # threads each, two reconstructions on two cores were ten times slower.
         os.environ.update({name: self.environment[name] for name in ("OMP_NUM_THREADS", "PYTHONWARNINGS")})
@@ -135,14 +131,7 @@ def _last_lines(log: Path) -> str:
 
 
 def execute(cell: Cell, words: Sequence[str], root: Path, variables: dict[str, str]) -> None:
-    """Run a cell's command in this process, keep what came of it, and end the process with the command's exit code.
-
-    Args:
-        cell: what is done.
-        words: the command line, `python -m MODULE …`.
-        root: the experiment's folder.
-        variables: of the environment.
-    """
+    """Run a cell's command line in this process, keep what came of it, and end the process with its exit code."""
     threading.Thread(target=_end_with_experiment, name="end with the experiment", daemon=True).start()
     os.environ.clear()
     os.environ.update(variables)

@@ -2,16 +2,17 @@
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from avp_habitat import command
 from avp_habitat.command import progress
 from avp_habitat.errors import RolloutError, UsageError
-from avp_habitat.metrics import FIGURES, explained
+from avp_habitat.metrics import FIGURES, METRICS_HELP, explained, figure_of, find_metrics, measured
 from avp_habitat.rollout.format import name_of, read_rollout
 from avp_habitat.rollout.seen import visibility_of
 from avp_habitat.sight.visibility import Visibility
@@ -30,28 +31,33 @@ class Report:
     """Folder, scene, policy, views; coverage as the rollout says it, None where it does not."""
     found: Visibility
     """Of its held-out pixels."""
+    further: dict[str, float]
+    """What the chosen metrics of the rollout give, by the figures' names."""
 
     def as_json(self) -> dict[str, Any]:
         """For programs: shares within [0, 1], also per held-out view and after each frame."""
         per_view = [None if share != share else share for share in self.found.per_view().tolist()]
         further = {"pixels": len(self.found.view), "per_view": per_view, "curve": self.found.curve().tolist()}
-        return self.about | self.found.figures() | further
+        return self.about | self.found.figures() | self.further | further
 
     def as_row(self) -> list[str]:
         """For people: shares in percent."""
         values = self.about | self.found.figures()
         shares = ["" if values[name] is None else FIGURES[name].text(values[name]) for name in _SHARES]
-        return [str(values[name]) for name in _ABOUT] + shares
+        own = [figure_of(name).text(value) for name, value in self.further.items()]
+        return [str(values[name]) for name in _ABOUT] + shares + own
 
 
-def report_on(folder: Path, *, stride: int | None = None) -> Report:
+def report_on(folder: Path, *, stride: int | None = None, metrics: Sequence[str] = ()) -> Report:
     """Read a rollout and measure what its frames have seen of its held-out views.
 
     Args:
         folder: of the rollout.
         stride: as `visibility_of` takes it.
+        metrics: of rollouts, as `metrics.find_metrics` takes them.
 
     Raises:
+        UsageError: no such metric.
         RolloutError: the rollout is damaged, or no held-out view shows a surface.
     """
     rollout = read_rollout(folder)
@@ -69,7 +75,7 @@ def report_on(folder: Path, *, stride: int | None = None) -> Report:
         "views": len(rollout.frames),
         "coverage": None if coverage is None else float(coverage),
     }
-    return Report(about, found)
+    return Report(about, found, measured(metrics, "rollout", rollout))
 
 
 @dataclass(frozen=True)
@@ -84,6 +90,7 @@ class Seen:
     every: int | None = None
     """Test every N-th row and column of the held-out views; 1 tests all pixels, in about a minute (omitted: about 1,200
     pixels of each view)."""
+    metrics: Annotated[tuple[str, ...], arg(help=METRICS_HELP)] = ()
     json: bool = False
     """Print JSON, with the shares per held-out view and after each frame."""
 
@@ -91,6 +98,7 @@ class Seen:
         """Refuse what cannot be."""
         if not self.rollouts:
             raise UsageError("rollouts: expected at least one rollout folder")
+        find_metrics(self.metrics)
         if self.every is not None and self.every < 1:
             raise UsageError(f"every: expected a whole number from 1, got {self.every}")
 
@@ -99,11 +107,12 @@ def main(options: Seen) -> None:
     """Print a line for each rollout."""
     several = len(options.rollouts) > 1
     waiting = progress(options.rollouts, desc="reading", unit="rollout") if several else options.rollouts
-    reports = [report_on(folder, stride=options.every) for folder in waiting]
+    reports = [report_on(folder, stride=options.every, metrics=options.metrics) for folder in waiting]
     if options.json:
         print(json.dumps([report.as_json() for report in reports], indent=2, allow_nan=False))
         return
-    head = [*_ABOUT, *(FIGURES[name].title for name in _SHARES)]
+    further = [figure_of(name).heading for name in reports[0].further]
+    head = [*_ABOUT, *(FIGURES[name].title for name in _SHARES), *further]
     print(table(head, [report.as_row() for report in reports], words=3, markdown=False))
     print(f"\n{_MEANING}")
 

@@ -22,7 +22,7 @@ from avp_habitat.tracking.stores import address_of, open_store
 
 
 @dataclass(frozen=True)
-class Reconstruction:
+class Reconstruct:
     """Train on the captured frames of a rollout and score its held-out views.
 
     The scores are written to a folder that exists only when all is done.
@@ -55,7 +55,7 @@ class Reconstruction:
             raise UsageError(f"iterations: expected a number from 1, got {self.iterations}")
 
 
-def reconstruct(options: Reconstruction) -> dict[str, Any]:
+def reconstruct(options: Reconstruct) -> dict[str, Any]:
     """Train on a rollout, score all held-out views, write the folder.
 
     Returns:
@@ -81,7 +81,7 @@ def reconstruct(options: Reconstruction) -> dict[str, Any]:
             return process(options, rollout, folder, started=started, address=address)
 
 
-def _check_rollout(options: Reconstruction, rollout: Rollout) -> None:
+def _check_rollout(options: Reconstruct, rollout: Rollout) -> None:
     for kind, views in (("captured frame", rollout.frames), ("held-out view", rollout.heldout)):
         if not views:
             raise RolloutError(f"{rollout.folder}: expected at least one {kind}, found none")
@@ -96,7 +96,7 @@ def _check_rollout(options: Reconstruction, rollout: Rollout) -> None:
         )
 
 
-def main(options: Reconstruction) -> None:
+def main(options: Reconstruct) -> None:
     """Reconstruct one rollout; print its scores."""
     found = reconstruct(options)
     words = ", ".join(f"{name} {value:.4g}" for name, value in found["scores"].items() if value is not None)

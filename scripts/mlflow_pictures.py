@@ -1,18 +1,19 @@
 """Make the pictures of MLflow's page in the docs: real runs by the suite's commands, looked at with a browser."""
 
-import argparse
 import json
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from mlflow_page import chromium, mlflow_server, opened
 from PIL import Image
+from tyro.conf import UseAppendAction
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
@@ -29,40 +30,49 @@ _SETTLE_S = 3.0
 _FIGURES = "metrics.`eval/psnr` > -1000"
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    add = parser.add_argument
-    add("--scene", default="builtin:0", help="of the rollouts and of the evaluation")
-    add("--policy", default=None, action="append", metavar="POLICY", help=f"give it again; {', '.join(POLICIES)}")
-    add("--views", default=40, type=int, help="of each rollout")
-    add("--rollouts", default=1, type=int, help="of each policy, from seed 1 on")
-    add("--iterations", default=400, type=int, help="of each reconstruction")
-    add("--steps", default=60_000, type=int, help="of each of the two trainings")
-    add("--work", default=Path("runs/mlflow-pictures"), type=Path, help="what is there is not made again")
-    add("--mlflow", default=None, metavar="ADDRESS", help="make no runs, but look at those of this store")
-    add("--experiment", default="avp", help="that is looked at with --mlflow")
-    add("--out", default=Path("docs/pictures"), type=Path, help="folder of the pictures")
-    return parser
+@dataclass(frozen=True)
+class Pictures:
+    """Make the pictures of MLflow's page in the docs: real runs by the suite's commands, looked at with a browser."""
+
+    scene: str = "builtin:0"
+    """Of the rollouts and of the evaluation."""
+    policy: UseAppendAction[tuple[str, ...]] = ()
+    """Give it again; heuristic, spin and survey where none is given."""
+    views: int = 40
+    """Of each rollout."""
+    rollouts: int = 1
+    """Of each policy, from seed 1 on."""
+    iterations: int = 400
+    """Of each reconstruction."""
+    steps: int = 60_000
+    """Of each of the two trainings."""
+    work: Path = Path("runs/mlflow-pictures")
+    """What is there is not made again."""
+    mlflow: str | None = None
+    """Make no runs, but look at those of the store at this address."""
+    experiment: str = "avp"
+    """That is looked at with --mlflow."""
+    out: Path = Path("docs/pictures")
+    """Folder of the pictures."""
 
 
-def main(argv: Sequence[str]) -> None:
+def main(options: Pictures) -> None:
     """Make the runs unless they are there, then the pictures."""
-    options = _parser().parse_args(argv)
-    options.policy = options.policy or list(POLICIES)
     options.work.mkdir(parents=True, exist_ok=True)
-    store = options.mlflow
+    store, experiment = options.mlflow, options.experiment
     if store is None:
-        store, options.experiment = f"sqlite:///{options.work.absolute()}/mlflow.db", "avp"
+        store, experiment = f"sqlite:///{options.work.absolute()}/mlflow.db", "avp"
         _make_runs(options, store)
     options.out.mkdir(parents=True, exist_ok=True)
-    _photograph(store, options.experiment, options.out, options.work / "server")
+    _photograph(store, experiment, options.out, options.work / "server")
 
 
-def _make_runs(options: argparse.Namespace, store: str) -> None:
-    for policy in options.policy:
+def _make_runs(options: Pictures, store: str) -> None:
+    policies = options.policy or POLICIES
+    for policy in policies:
         for seed in range(1, options.rollouts + 1):
             _reconstruct(options, policy, seed, store)
-    words = [word for policy in options.policy for word in ("--policy", policy)]
+    words = [word for policy in policies for word in ("--policy", policy)]
     where = ["--scene", options.scene, "--episodes", "6", "--out", options.work / "report"]
     _once(options.work / "report", store, "-m", "avp_sb3.evaluate", *words, *where)
     for observation in ("numbers", "map"):
@@ -72,7 +82,7 @@ def _make_runs(options: argparse.Namespace, store: str) -> None:
     _run(store, "-m", "avp_habitat.tracking.compare")
 
 
-def _reconstruct(options: argparse.Namespace, policy: str, seed: int, store: str) -> None:
+def _reconstruct(options: Pictures, policy: str, seed: int, store: str) -> None:
     name = f"{Path(policy).stem}-{seed}"
     rollout, trained = options.work / name, options.work / "nerf" / name / "avp-nerfacto" / "t"
     words = ["--policy", policy, "--seed", seed, "--scene", options.scene, "--budget", options.views]

@@ -28,7 +28,7 @@ def room(seed: int) -> Image.Image:
 
 def main() -> None:
     """Write docs/pictures/overview.png."""
-    rollout = Path(sys.argv[1] if len(sys.argv) > 1 else "runs/demo/rollouts/learned")
+    rollout = Path(sys.argv[1] if len(sys.argv) > 1 else "runs/demo/cells/collect/proposed-builtin_0-0-0/rollout")
     with Image.open(rollout / "trajectory.png") as found:
         drawn = found.convert("RGB")
     drawn.thumbnail(TILE, Image.Resampling.LANCZOS)

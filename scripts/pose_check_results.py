@@ -6,7 +6,6 @@ of the known mistakes.
 What was judged already is read again from `--work`: a run that was stopped goes on.
 """
 
-import argparse
 import json
 import os
 import platform
@@ -21,7 +20,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from pose_faults import FAULTS, MORE_FAULTS, SMALL_FAULTS, damaged, write_faulty
@@ -32,6 +31,7 @@ from avp_habitat.collect import Collect, collect
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.poses import Intrinsics
 from avp_habitat.provenance import installed_versions
+from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.format import Rollout
 from avp_habitat.task.settings import TaskSettings
 from avp_nerfstudio.check.depth_maps import DepthMaps, load_depth_maps
@@ -181,7 +181,34 @@ def _faulty(rollout: Rollout, known: Known, folder: Path, number: int) -> Iterat
         }
 
 
-def measure_all(options: argparse.Namespace) -> list[dict[str, Any]]:
+@dataclass(frozen=True)
+class PoseCheckResults:
+    """Measure how often the pose checks refuse a correct rollout, and how small a fault they catch."""
+
+    scene: tuple[str, ...] = ()
+    """Rooms besides the built-in ones."""
+    rollouts: Annotated[int, Range(1, 10**9)] = 150
+    """How many."""
+    first: int = 1000
+    """The first one's number."""
+    damaged: int = 30
+    """How many of them are damaged too, every fifth at most."""
+    jobs: Annotated[int, Range(1, 1024)] = os.cpu_count() or 1
+    """Processes."""
+    work: Path = Path("runs/pose-checks")
+    """Rollouts and what was judged."""
+    out: Path = Path("docs/results/pose_checks")
+    """Tables."""
+
+    def __post_init__(self) -> None:
+        """Hold the ranges, and refuse a scene that is no file."""
+        hold_ranges(self)
+        for scene in self.scene:
+            if not Path(scene).is_file():
+                raise UsageError(f"scene: {scene}: expected a file, found none")
+
+
+def measure_all(options: PoseCheckResults) -> list[dict[str, Any]]:
     """Measure every number, one per process at a time."""
     numbers = range(options.first, options.first + options.rollouts)
     damaged = numbers[::DAMAGED_EVERY][: options.damaged]
@@ -267,11 +294,11 @@ def known_fault_table(found: Sequence[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def write_results(options: argparse.Namespace, found: list[dict[str, Any]], argv: Sequence[str]) -> None:
+def write_results(options: PoseCheckResults, found: list[dict[str, Any]]) -> None:
     """The tables and the JSON file."""
     options.out.mkdir(parents=True, exist_ok=True)
     about = {
-        "command": shlex.join(["python", "scripts/pose_check_results.py", *argv]),
+        "command": shlex.join(["python", "scripts/pose_check_results.py", *sys.argv[1:]]),
         "commit": _commit(),
         "machine": f"{os.cpu_count()} CPU cores, {platform.system()} {platform.machine()}",
         "versions": installed_versions(_VERSIONED),
@@ -336,35 +363,15 @@ def _commit() -> str:
     return done.stdout.strip() or "unknown"
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    add = parser.add_argument
-    add("--scene", nargs="*", default=[], metavar="FILE", help="rooms besides the built-in ones")
-    add("--rollouts", default=150, type=int, help="how many")
-    add("--first", default=1000, type=int, metavar="NUMBER", help="the first one's number")
-    add("--damaged", default=30, type=int, help="how many of them are damaged too, every fifth at most")
-    add("--jobs", default=os.cpu_count(), type=int, help="processes")
-    add("--work", default=Path("runs/pose-checks"), type=Path, help="rollouts and what was judged")
-    add("--out", default=Path("docs/results/pose_checks"), type=Path, help="tables")
-    return parser
-
-
-def main(argv: Sequence[str]) -> None:
+def main(options: PoseCheckResults) -> None:
     """Collect, damage, judge, write.
 
     Raises:
         AVPError: there were more false alarms than the goal allows; the results are written all the same.
     """
-    options = _parser().parse_args(argv)
-    for scene in options.scene:
-        if not Path(scene).is_file():
-            raise UsageError(f"--scene {scene}: expected a file, found none")
-    for name in ("rollouts", "jobs"):
-        if getattr(options, name) < 1:
-            raise UsageError(f"--{name}: expected a whole number from 1")
     options.work.mkdir(parents=True, exist_ok=True)
     found = measure_all(options)
-    write_results(options, found, argv)
+    write_results(options, found)
     print(f"{options.out}: tables")
     alarms = [f"rollout {one['number']}" for one in found if one["failed"]]
     if len(alarms) > GOAL * len(found):

@@ -1,6 +1,5 @@
 """Search the rewards' constants: train with random ones, score the policies, log every trial to MLflow."""
 
-import argparse
 import json
 import multiprocessing
 import os
@@ -10,10 +9,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from tqdm import tqdm
+from tyro.conf import arg
 
 from avp_habitat import command
 from avp_habitat.provenance import git_commit
@@ -152,26 +152,30 @@ def _log(run: str | None, figures: dict[str, float]) -> None:
         client.log_metric(str(run), f"search/{name}", value)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    add = parser.add_argument
-    add("--scene", nargs="+", required=True, help=SCENES)
-    add("--trials", default=12, type=int, help="trainings, the first with the constants in use")
-    add("--steps", default=400_000, type=int, help="environment steps of each")
-    add("--jobs", default=2, type=int, help="trainings at a time")
-    add("--seed", default=0, type=int, help="of the draws, the policies and the starts")
-    add("--out", default=Path("docs/results/reward_search.json"), type=Path, help="all trials, the best first")
-    return parser
+@dataclass(frozen=True)
+class SearchRewards:
+    """Search the rewards' constants: train with random ones, score the policies, log every trial to MLflow."""
+
+    scene: Annotated[tuple[str, ...], arg(help=SCENES)]
+    trials: int = 12
+    """Trainings, the first with the constants in use."""
+    steps: int = 400_000
+    """Environment steps of each."""
+    jobs: int = 2
+    """Trainings at a time."""
+    seed: int = 0
+    """Of the draws, the policies and the starts."""
+    out: Path = Path("docs/results/reward_search.json")
+    """All trials, the best first."""
 
 
-def main(argv: Sequence[str]) -> None:
+def main(options: SearchRewards) -> None:
     """Run the trials that are not in the output file yet; what is done is kept after Ctrl-C."""
-    options = _parser().parse_args(argv)
     os.environ.setdefault("MLFLOW_TRACKING_URI", "sqlite:///mlflow.db")
     os.environ["OMP_NUM_THREADS"] = "1"
     done = read(options.out)
     trials = [
-        Trial(number, draw_constants(number, options.seed), tuple(options.scene), options.steps, options.seed)
+        Trial(number, draw_constants(number, options.seed), options.scene, options.steps, options.seed)
         for number in range(options.trials)
     ]
     trials = [trial for trial in trials if not is_done(trial, done)]

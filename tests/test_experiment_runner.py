@@ -29,7 +29,7 @@ def done(folder):
     return sorted(folder.glob(f"cells/*/*/{DONE}"))
 
 
-def wait_for(condition, seconds=90):
+def wait_for(condition, seconds=300):
     until = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < until, "waited too long"
@@ -52,7 +52,7 @@ def test_killed_half_way_it_goes_on_with_what_is_missing_and_repeats_nothing(tmp
     before = {path: path.read_bytes() for path in done(tmp_path)}
     assert 2 <= len(before) < 6
     second = start(tmp_path)
-    failed, errors = second.communicate(timeout=120)
+    failed, errors = second.communicate(timeout=300)
     assert (second.returncode, json.loads(failed)) == (0, {}), errors
     assert len(done(tmp_path)) == 6
     assert {path: path.read_bytes() for path in before} == before

@@ -101,7 +101,8 @@ def test_the_page_and_the_manifest_name_all_groups():
 def test_the_commands_of_the_page_run_as_written_from_outside(site, tmp_path):
     (tmp_path / "try_it.py").write_text(FILES["try_it.py"])
     lines = [words for words in COMMANDS if words[0] == "python" and "avp_sb3.train" not in words]
-    assert len(lines) == 6
+    assert len(lines) == 7
+    lines.sort(key=lambda words: "own.zip" in words)
     said = outside(site, tmp_path, sys.executable, "-c", DRIVER, json.dumps(lines))
     assert re.search(r"\|    new floor +\| [\d.]+ ", said)
     rollouts = {
@@ -109,6 +110,7 @@ def test_the_commands_of_the_page_run_as_written_from_outside(site, tmp_path):
     }
     assert (rollouts["r1"]["reward"], rollouts["r2"]["policy"]["name"]) == ("thrifty", "wanderer")
     assert rollouts["r3"]["simulator"] == {"name": "hall", "version": "1"}
+    assert re.search(r"own\.zip +\| wanderer", said)
     assert "turned_deg" in (tmp_path / "runs" / "r4" / "rollout.json").read_text()
     header = (tmp_path / "runs" / "r1" / "steps.csv").read_text().splitlines()[0]
     assert {"reward_new floor", "reward_seen before", "reward_time", "reward_end"} <= set(header.split(","))
@@ -328,6 +330,10 @@ def test_what_is_no_simulator_is_one_line(users, capsys, tmp_path):
         UsageError, match=r"navmesh: is of the simulator 'raycast' or 'habitat', but 'users_module:made'"
     ):
         SimulatorChoice("users_module:made", navmesh=Path("a.navmesh"))
+    with pytest.raises(UsageError, match=r"simulator 'users_module:number': expected a factory of .*, got 3"):
+        SimulatorChoice("users_module:number")
+    with pytest.raises(UsageError, match=r"unknown simulator 'raycats': .* did you mean 'raycast'"):
+        SimulatorChoice("raycats")
     words = ["--scene", "a", "--policy", "random", "--simulator", "users_modul:made", "--out", "r"]
     assert command.run(collect, words) == 2
     assert capsys.readouterr().err.count("\n") == 1

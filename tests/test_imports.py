@@ -21,7 +21,6 @@ LIGHT = (
     "plugins",
     "poses",
     "ranges",
-    "rollout.format",
     "task.rewards",
     "task.trajectory",
 )

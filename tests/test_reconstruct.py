@@ -17,7 +17,7 @@ from avp_habitat.rollout.images import read_rgb
 from avp_habitat.rollout.seen import visibility_of
 from avp_nerfstudio import reconstruct
 from avp_nerfstudio.method.checkpoints import TrainedRunError, config_path
-from avp_nerfstudio.reconstruct import Reconstruction
+from avp_nerfstudio.reconstruct import Reconstruct
 
 ITERATIONS = ("--iterations", "3")
 
@@ -72,7 +72,7 @@ def test_a_reconstruction_leaves_scores_pictures_and_nothing_else(room, tmp_path
 
 
 def test_pictures_and_visibility_are_those_of_the_rollout(room, tmp_path):
-    found = reconstruct.reconstruct(Reconstruction(room, tmp_path / "out", iterations=3, frames=2, pictures=(1,)))
+    found = reconstruct.reconstruct(Reconstruct(room, tmp_path / "out", iterations=3, frames=2, pictures=(1,)))
     rollout = read_rollout(room)
     seen = visibility_of(rollout.frames[:2], rollout.heldout, rollout.intrinsics)
     assert found["visibility"]["visibility"] == seen.figures()["visibility"]
@@ -85,7 +85,7 @@ def test_pictures_and_visibility_are_those_of_the_rollout(room, tmp_path):
 
 def test_the_seed_decides_and_frames_matter(room, tmp_path):
     def psnr(name, **options):
-        return reconstruct.reconstruct(Reconstruction(room, tmp_path / name, iterations=3, **options))["scores"]["psnr"]
+        return reconstruct.reconstruct(Reconstruct(room, tmp_path / name, iterations=3, **options))["scores"]["psnr"]
 
     first = psnr("a", seed=1)
     assert psnr("b", seed=1) == first

@@ -1,4 +1,3 @@
-import logging
 import os
 import shutil
 import signal
@@ -7,7 +6,6 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from mlflow import MlflowClient
 from tracking import mlflow_home
@@ -219,19 +217,6 @@ def test_a_run_made_offline_is_made_once_whoever_asks(address):
     assert (found.info.run_name, found.info.status) == ("mine", "FINISHED")
     assert found.data.metrics == {"a": 1.0}
     assert continue_run(address, offline_id).run_id == found.info.run_id
-
-
-def test_a_disk_that_takes_no_journal_is_said_and_the_points_arrive(address, monkeypatch, caplog, tmp_path):
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("AVP_MLFLOW_SPOOL", str(tmp_path / "file"))
-    with caplog.at_level(logging.WARNING):
-        run = start_run(address, NewRun())
-        run.metrics({"a": 1.0}, 1)
-        run.image("map", np.zeros((4, 5, 3), dtype=np.uint8), 1)
-        assert run.close("FINISHED")
-    assert "cannot be kept on disk at" in caplog.text
-    assert points(address, run.run_id, "a") == [(1, 1.0)]
-    assert len(MlflowClient(address).list_artifacts(run.run_id, "images")) == 2
 
 
 def test_addresses_are_shown_without_passwords():

@@ -20,8 +20,9 @@ def script(monkeypatch):
 
 
 def cells_of(page):
-    """Lines of tables without their titles, which may change."""
-    return [line.split("|")[2:] for line in page.read_text(encoding="utf-8").splitlines() if "±" in line]
+    """Lines of tables without their titles, in an order of their own, as the tables' order is not the script's."""
+    lines = [line for line in page.read_text(encoding="utf-8").splitlines() if "±" in line]
+    return sorted(sorted(cell.strip() for cell in line.split("|")[2:]) for line in lines)
 
 
 def test_tables_are_made_from_what_is_stored(script, tmp_path):
@@ -38,8 +39,9 @@ def test_tables_are_made_from_what_is_stored(script, tmp_path):
 def test_another_stored_number_is_another_number_in_the_table(script, tmp_path):
     folder = shutil.copytree(STORED, tmp_path / "training")
     table = folder / "white_room" / "table.md"
+    script.write_tables(folder, ["white_room.glb", "grey_white_room.glb"])
     before = cells_of(table)
     stored = folder / "white_room" / "episodes.csv"
     stored.write_text(stored.read_text().replace("heuristic,1000,0.161845478", "heuristic,1000,0.961845478"))
     script.write_tables(folder, ["white_room.glb", "grey_white_room.glb"])
-    assert sum(a != b for a, b in zip(before, cells_of(table), strict=True)) == 1
+    assert sum(row not in before for row in cells_of(table)) == 1

@@ -187,7 +187,7 @@ make_vec_env(spec.make, n_envs=2, env_kwargs={kwargs!r}, vec_env_cls=SubprocVecE
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=100)
     lines = done.stderr.splitlines()
     assert sum(line.startswith(told) for line in lines) >= 1, "the other process may be ended before it can say it"
-    assert lines[-1] == "EOFError"
+    assert lines[-1].startswith(("EOFError", "ConnectionResetError", "BrokenPipeError"))
     assert "Process ForkServerProcess" not in done.stderr, "that is how a traceback of a process begins"
 
 

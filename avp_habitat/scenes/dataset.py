@@ -89,8 +89,8 @@ class SceneDataset:
             if len(matches) > 1:
                 handles = _in_short([entry.handle for entry in matches])
                 raise SceneError(f"{self.path}: {scene_id!r} stands for {len(matches)} scenes: {handles}")
-            found = self._instance(matches[0]) if matches[0] in self.scenes else self._stage(matches[0])
             entry = matches[0]
+            found = self._instance(entry) if entry in self.scenes else self._stage(entry)
             return replace(found, name=entry.name, scene_id=entry.handle)
         near = difflib.get_close_matches(scene_id, sorted({*names, *(each.words for each in every)}), n=2, cutoff=0.5)
         hint = f"did you mean {' or '.join(near)}? " if near else ""
@@ -124,12 +124,10 @@ class SceneDataset:
         if not isinstance(cell, dict) or not isinstance(cell.get("attributes"), dict):
             raise SceneError(f"{self.path}: {where}.attributes: expected an object, got {shown(cell)}")
         change = Layer(cell["attributes"], self.path, f"{where}.attributes.")
-        given = {key: value for key, value in cell.items() if value is not None}
-        origin, handle = (
-            member(given, key, "", f"{self._where}{where}.") for key in ("original_file", "template_handle")
-        )
+        told = f"{self._where}{where}."
+        origin, handle = (member(cell, key, "", told) for key in ("original_file", "template_handle"))
         if origin:
-            before = self._stage_of(origin, f"{self._where}{where}.original_file")
+            before = self._stage_of(origin, f"{told}original_file")
             if not handle:
                 self.stages.remove(before)
             self.stages.append(Entry(handle or before.handle, before.file, (*before.changes, change)))

@@ -141,7 +141,7 @@ class _Buffers:
         return self._content[index]
 
     def _dense(self, index: int, dtype: np.dtype, shape: tuple[int, int]) -> NDArray:
-        accessor = self._document.accessors[index]
+        accessor: Any = self._document.accessors[index]
         stride = self._document.bufferViews[accessor.bufferView].byteStride or dtype.itemsize * shape[1]
         data, offset = self.view(accessor.bufferView), accessor.byteOffset or 0
         end = offset + (shape[0] - 1) * stride + dtype.itemsize * shape[1]

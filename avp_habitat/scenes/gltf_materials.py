@@ -40,7 +40,6 @@ class Surface:
     factor: NDArray[np.float32]
     """`(4,)` colour and alpha that multiply the picture."""
     texture: int | None = None
-    """Index of the texture."""
     coordinates: str = "TEXCOORD_0"
     """Name of the attribute that holds the texture coordinates."""
     transform: NDArray[np.float32] | None = None

@@ -24,18 +24,17 @@ _WHITE = (1.0, 1.0, 1.0)
 
 @dataclass
 class _Material:
-    """What a material says about colour."""
+    """What a material says about colour.
+
+    `diffuse` is `Kd`; `picture` the file of `map_Kd`, whose texture coordinates are multiplied by `scale` (`-s`), then
+    shifted by `offset` (`-o`), as Blender and three.js do; `unread` is what is not followed.
+    """
 
     diffuse: tuple[float, ...] = _WHITE
-    """`Kd`, red, green and blue."""
     picture: str | None = None
-    """File name of `map_Kd`, as it stands there."""
     scale: tuple[float, ...] = (1.0, 1.0)
-    """`-s`: factors of the texture coordinates u and v."""
     offset: tuple[float, ...] = (0.0, 0.0)
-    """`-o`: added to the scaled texture coordinates, as Blender and three.js do."""
-    lost: list[str] = field(default_factory=list)
-    """What is not followed."""
+    unread: list[str] = field(default_factory=list)
 
     def take(self, word: str, rest: str) -> None:
         """Follow one line of a library; ValueError where it cannot be right."""
@@ -45,16 +44,16 @@ class _Material:
         elif key == "map_kd":
             self._take_texture(rest.strip())
         elif key in _LOST:
-            self.lost.append(word)
+            self.unread.append(word)
         elif key in ("d", "ke"):
             numbers = [float(each) for each in re.findall(_NUMBER, rest, re.I)]
             if any(number < 1 if key == "d" else number > 0 for number in numbers):
-                self.lost.append(f"{word} {rest}")
+                self.unread.append(f"{word} {rest}")
 
     def _take_diffuse(self, rest: str) -> None:
         words = rest.split()
         if words and words[0] in ("spectral", "xyz"):
-            self.lost.append(f"Kd {words[0]}")
+            self.unread.append(f"Kd {words[0]}")
             return
         numbers = tuple(float(word) for word in words[:3])
         if len(numbers) not in (1, 3):
@@ -71,7 +70,7 @@ class _Material:
             elif option == "-o":
                 self.offset = (*map(float, words.split()), 0.0, 0.0)[:2]
             elif option not in _NEUTRAL and words != "off":
-                self.lost.append(f"{option} {words}")
+                self.unread.append(f"{option} {words}")
         if not rest:
             raise ValueError("expected the name of a picture")
         self.picture = rest
@@ -123,13 +122,8 @@ class _Reader:
         self._names: dict[str | None, int] = {None: 0}
         self._material = 0
         self._library: dict[str, _Material] = {}
-        self._takes = {
-            "v": self._vertex,
-            "vt": self._coordinate,
-            "f": self._face,
-            "usemtl": self._use,
-            "mtllib": self._read_library,
-        }
+        self._takes = {"v": self._vertex, "vt": self._coordinate, "f": self._face, "usemtl": self._use}
+        self._takes["mtllib"] = self._read_library
 
     def take(self, word: str, rest: str) -> None:
         """Read one line; what is not known has no surface. ValueError where it cannot be right."""
@@ -221,8 +215,8 @@ class _Reader:
         if material.picture and not any(material.diffuse):
             warn_once(path, f"its material {name!r} has a picture and a black Kd, which is taken for white")
             material = replace(material, diffuse=_WHITE)
-        if material.lost:
-            warn_once(path, f"of its material {name!r}, {', '.join(material.lost)} is not followed")
+        if material.unread:
+            warn_once(path, f"of its material {name!r}, {', '.join(material.unread)} is not followed")
         return material
 
 

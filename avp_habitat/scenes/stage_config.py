@@ -113,9 +113,11 @@ def read_config(path: Path) -> dict[str, Any]:
     return content
 
 
-def member(cell: Any, key: str, default: Value, where: str) -> Value:
+def member(cell: dict[str, Any], key: str, default: Value, where: str) -> Value:
     """The object, list or text under a key of a JSON object, or the default; SceneError where it is something else."""
-    value = cell.get(key, default) if isinstance(cell, dict) else cell
+    value = cell.get(key, default)
+    if value is None and isinstance(default, str):
+        return default
     if not isinstance(value, type(default)):
         kind = {dict: "an object", list: "a list", str: "a text"}[type(default)]
         raise SceneError(f"{where}{key}: expected {kind}, got {shown(value)}")

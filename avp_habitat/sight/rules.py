@@ -205,3 +205,18 @@ def _view_quality(eye, points, normals):
         for j in range(len(points)):
             found[i, j] = quality(eye[i], points[j], normals[j])
     return found
+
+
+@njit(cache=True)
+def agreeing_depths(depth, pose, camera, points, tolerance_m, tolerance_share):
+    """`(m,)` whether points lie inside the image, and the depth image `(height, width)` shows each at its own depth."""
+    seen = np.zeros(len(points), np.bool_)
+    for j in range(len(points)):
+        right, up, ahead = in_camera(pose, points[j])
+        if in_image(right, up, ahead, camera):
+            # |d - z| <= t in inverse depth; 1/d is at most 1/(z - t), unbounded where the camera is that near.
+            tolerance = max(tolerance_m, tolerance_share * ahead)
+            least, most = 1.0 / (ahead + tolerance), 1.0 / max(ahead - tolerance, 1e-6)
+            between, nearest = inverse_depths(depth, right, up, ahead, camera)
+            seen[j] = least <= between <= most or least <= nearest <= most
+    return seen

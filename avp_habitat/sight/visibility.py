@@ -15,10 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.compiled import njit
 from avp_habitat.metrics import ALIKE_DEG, ALIKE_DISTANCE, PARALLAX_DEG
 from avp_habitat.poses import Intrinsics, pixel_directions
-from avp_habitat.sight.rules import camera_numbers, in_camera, in_image, inverse_depths
 
 Float = NDArray[np.floating]
 DepthView = tuple[Float, Float]
@@ -148,22 +146,12 @@ def points_seen(depth: Float, camera_to_world: Float, intrinsics: Intrinsics, po
     Returns:
         `(k,)` their indices, ascending.
     """
+    # Late, so that who only asks for the limits above, as every table of figures does, loads no Numba.
+    from avp_habitat.sight.rules import agreeing_depths, camera_numbers
+
     pose, camera = np.ascontiguousarray(camera_to_world, np.float64), camera_numbers(intrinsics)
-    return np.flatnonzero(_points_seen(np.ascontiguousarray(depth), pose, camera, points))
-
-
-@njit(cache=True)
-def _points_seen(depth, pose, camera, points):
-    seen = np.zeros(len(points), np.bool_)
-    for j in range(len(points)):
-        right, up, ahead = in_camera(pose, points[j])
-        if in_image(right, up, ahead, camera):
-            # |d - z| <= t in inverse depth; 1/d is at most 1/(z - t), unbounded where the camera is that near.
-            tolerance = max(TOLERANCE_M, TOLERANCE_SHARE * ahead)
-            least, most = 1.0 / (ahead + tolerance), 1.0 / max(ahead - tolerance, 1e-6)
-            between, nearest = inverse_depths(depth, right, up, ahead, camera)
-            seen[j] = least <= between <= most or least <= nearest <= most
-    return seen
+    tolerances = TOLERANCE_M, TOLERANCE_SHARE
+    return np.flatnonzero(agreeing_depths(np.ascontiguousarray(depth), pose, camera, points, *tolerances))
 
 
 def visibility(points: HeldoutPoints, frames: Iterable[DepthView], intrinsics: Intrinsics) -> Visibility:

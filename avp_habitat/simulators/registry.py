@@ -38,6 +38,7 @@ def _habitat(scene: str, *, gpu: int | None = None, navmesh: Path | None = None,
 SIMULATORS: dict[str, Factory] = {"raycast": _raycast, "habitat": _habitat}
 """What is built in, by name."""
 _OPTIONS = ("gpu", "navmesh", "up")
+_EXPECTED = "expected a factory of (scene, gpu, navmesh, up)"
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,9 @@ class SimulatorChoice:
 
     def __post_init__(self) -> None:
         """Refuse what cannot work."""
+        factory = self.factory
+        if not callable(factory):
+            raise UsageError(f"simulator {self.name!r}: {_EXPECTED}, got {factory!r}")
         if self.navmesh is not None:
             object.__setattr__(self, "navmesh", Path(self.navmesh))
         if self.up not in (None, *UPS):
@@ -66,8 +70,8 @@ class SimulatorChoice:
         if self.gpu is not None and (isinstance(self.gpu, bool) or not isinstance(self.gpu, int) or self.gpu < -1):
             raise UsageError(f"gpu: expected a CUDA device from 0, or -1 for none, got {self.gpu!r}")
         for option in self.options:
-            if not _takes(self.factory, option):
-                able = " or ".join(repr(name) for name, factory in SIMULATORS.items() if _takes(factory, option))
+            if not _takes(factory, option):
+                able = " or ".join(repr(name) for name, known in SIMULATORS.items() if _takes(known, option))
                 chosen = f"but {self.name!r} was chosen; leave it out, or choose {able}"
                 raise UsageError(f"{option}: is of the simulator {able}, {chosen}")
 
@@ -163,9 +167,7 @@ def _opened(choice: SimulatorChoice, scene: str) -> Simulator:
     try:
         inspect.signature(choice.factory).bind(scene, **choice.options)
     except TypeError as error:
-        raise UsageError(
-            f"simulator {choice.name!r}: expected a factory of (scene, gpu, navmesh, up): {error}"
-        ) from None
+        raise UsageError(f"simulator {choice.name!r}: {_EXPECTED}: {error}") from None
     simulator = choice.factory(scene, **choice.options)
     if missing := [each for each in ASKED if each not in dir(simulator)]:
         raise UsageError(f"simulator {choice.name!r}: {type(simulator).__name__} has no {', '.join(missing)}")

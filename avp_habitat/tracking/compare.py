@@ -57,7 +57,7 @@ More PSNR and SSIM are better, less LPIPS; fewer views are better. Means over th
 
 
 @dataclass(frozen=True)
-class Method:
+class ComparedMethod:
     """One row: the runs of a policy in a scene, by one method."""
 
     policy: str
@@ -80,7 +80,7 @@ class Method:
         return [self.policy, self.scene, self.method, str(self.runs), *texts]
 
 
-def compare(client: "MlflowClient", experiment_id: str, metrics: Sequence[str] = ()) -> list[Method]:
+def compare(client: "MlflowClient", experiment_id: str, metrics: Sequence[str] = ()) -> list[ComparedMethod]:
     """What an experiment's reconstructions, rollouts and evaluations (of its first 50,000 runs) say of each method.
 
     Args:
@@ -109,7 +109,7 @@ def compare(client: "MlflowClient", experiment_id: str, metrics: Sequence[str] =
 
 def _method(
     policy: str, scene: str, method: str, runs: Sequence[Mapping[str, float]], known: Mapping[str, Figure]
-) -> Method:
+) -> ComparedMethod:
     means, halves = {}, {}
     for name in [figure.name for figure in _ALWAYS] + [name for name in known if name not in FIGURES]:
         values = [run[f"eval/{name}"] for run in runs if f"eval/{name}" in run]
@@ -121,27 +121,27 @@ def _method(
     coverages, views = ([run[name] for run in runs] for name in ("eval/coverage", "eval/views"))
     means["cpv"] = coverage_per_view(coverages, views)  # type: ignore[arg-type]
     further = tuple(figure for name, figure in known.items() if name not in FIGURES and name in means)
-    return Method(policy, scene, method, len(runs), means, {**halves, "cpv": math.nan}, further)
+    return ComparedMethod(policy, scene, method, len(runs), means, {**halves, "cpv": math.nan}, further)
 
 
-def _rank(method: Method) -> tuple[Any, ...]:
+def _rank(method: ComparedMethod) -> tuple[Any, ...]:
     psnr = method.means.get("psnr", -math.inf)
     return method.scene, -psnr, -method.means["coverage"], method.policy, method.method
 
 
-def rows(methods: Sequence[Method]) -> tuple[list[str], list[list[str]]]:
+def rows(methods: Sequence[ComparedMethod]) -> tuple[list[str], list[list[str]]]:
     """Head and rows of the table; a user's metric has a column where a run has it."""
     shown = list(dict.fromkeys([*_ALWAYS, *(figure for method in methods for figure in method.further)]))
     head = ["policy", "scene", "method", "runs", *(figure.heading for figure in shown)]
     return head, [method.cells(shown) for method in methods]
 
 
-def markdown(methods: Sequence[Method]) -> str:
+def markdown(methods: Sequence[ComparedMethod]) -> str:
     """The table."""
     return table(*rows(methods)) + "\n"
 
 
-def picture(methods: Sequence[Method], path: Path) -> bool:
+def picture(methods: Sequence[ComparedMethod], path: Path) -> bool:
     """Draw PSNR against views, one point per method; False where none has a reconstruction."""
     from matplotlib.figure import Figure as Drawing
 
@@ -168,7 +168,7 @@ def picture(methods: Sequence[Method], path: Path) -> bool:
     return True
 
 
-def keep(client: "MlflowClient", experiment_id: str, methods: Sequence[Method]) -> str:
+def keep(client: "MlflowClient", experiment_id: str, methods: Sequence[ComparedMethod]) -> str:
     """Make or renew the run that compares these methods, one for each set of scenes; its id.
 
     Raises:
@@ -197,13 +197,13 @@ def keep(client: "MlflowClient", experiment_id: str, methods: Sequence[Method]) 
     return run_id
 
 
-def _write(folder: Path, methods: Sequence[Method]) -> None:
+def _write(folder: Path, methods: Sequence[ComparedMethod]) -> None:
     (folder / MARKDOWN).write_text(markdown(methods) + _HOW_TO_READ, encoding="utf-8")
     picture(methods, folder / PICTURE)
 
 
 @dataclass(frozen=True)
-class Compare:
+class CompareRuns:
     """Compare the policies of an MLflow experiment by their reconstructions and evaluations, and print the table.
 
     It is kept in the experiment as the run 'comparison', which is made once and then renewed.
@@ -224,7 +224,7 @@ class Compare:
             raise UsageError("mlflow: expected an address or auto, got off: it is MLflow's runs that are compared")
 
 
-def main(options: Compare) -> None:
+def main(options: CompareRuns) -> None:
     """Collect, compare, print, keep."""
     from mlflow.exceptions import MlflowException
 
@@ -260,7 +260,7 @@ def _experiment(client: "MlflowClient", option: str | None) -> "Experiment":
     return found
 
 
-def _methods(client: "MlflowClient", experiment: "Experiment", options: Compare) -> list[Method]:
+def _methods(client: "MlflowClient", experiment: "Experiment", options: CompareRuns) -> list[ComparedMethod]:
     methods = compare(client, experiment.experiment_id, options.metrics)
     if not methods:
         raise AVPError(

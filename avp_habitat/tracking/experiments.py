@@ -117,7 +117,7 @@ def search_tags(client: "MlflowClient", tags: Mapping[str, str], home: str | Non
 
 def create_run(client: "MlflowClient", header: Mapping[str, Any]) -> str:
     """The id of the run of a journal with this header, which is made when the store has none for its key."""
-    earlier = find_run(client, f"{OFFLINE}{header['key']}") if header.get("creating") else None
+    earlier = find_run(client, f"{OFFLINE}{header['key']}")
     if earlier is not None:
         return earlier.info.run_id
     identity = experiment_id(client, header["experiment"], header.get("experiment_id"))

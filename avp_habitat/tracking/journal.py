@@ -10,7 +10,6 @@ import fcntl
 import json
 import os
 import shutil
-import tempfile
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -64,31 +63,23 @@ class Journal:
 
     @classmethod
     def create(cls, header: Mapping[str, Any]) -> "Journal":
-        """A new journal in the spool folder; in a temporary one, with `problem` set, when the disk takes none there.
+        """A new journal in the spool folder.
 
         Raises:
-            TrackingError: that does not take one either.
+            TrackingError: the disk takes none.
         """
-        problems: list[str] = []
-        for home in (spool_folder(), Path(tempfile.gettempdir()) / f"avp-mlflow-{uuid4().hex}"):
-            journal = cls(home / header["key"], header)
-            try:
-                journal._make()
-            except OSError as error:
-                problems.append(f"{journal.folder}: {error.strerror or error}")
-            else:
-                journal.problem = problems[0] if problems else None
-                return journal
-        raise TrackingError(f"MLflow's points cannot be kept on disk: {'; '.join(problems)}")
-
-    def _make(self) -> None:
+        journal = cls(spool_folder() / header["key"], header)
         try:
-            self.folder.mkdir(parents=True, mode=0o700)
-            self._open()
-            self._write_header()
-        except OSError:
-            self.remove()
-            raise
+            journal.folder.mkdir(parents=True, mode=0o700)
+            journal._open()
+            journal._write_header()
+        except OSError as error:
+            journal.remove()
+            reason = f"{journal.folder}: cannot be written: {error.strerror or error}"
+            raise TrackingError(
+                f"{reason}; MLflow's points are kept there, name another folder in {SPOOL_VARIABLE}"
+            ) from None
+        return journal
 
     @classmethod
     def peek(cls, folder: Path) -> dict[str, Any] | None:

@@ -41,7 +41,6 @@ class TrackedRun:
         self._journal = journal
         self._names = SafeNames()
         self._sender = Sender(journal, client, **options)
-        self._warn_of_disk()
 
     @property
     def run_id(self) -> str:
@@ -137,9 +136,7 @@ class TrackedRun:
         return not journal.pending
 
     def _say_what_stays(self) -> None:
-        home = self._journal.folder
-        there = "" if home.parent == spool_folder() else f" --spool {home.parent}"
-        where = f"stay in {home}; send them with: {DELIVER}{there}"
+        where = f"stay in {self._journal.folder}; send them with: {DELIVER}"
         if self._journal.pending:
             reason = f"did not take all of run {self.run_id} ({self._sender.problem or 'it was too slow'})"
             _log.warning("MLflow at %s %s; its last points %s", shown(self.address), reason, where)
@@ -148,11 +145,8 @@ class TrackedRun:
 
     def _append(self, entry: dict[str, Any]) -> None:
         self._journal.append(entry)
-        self._warn_of_disk()
-
-    def _warn_of_disk(self) -> None:
         if (problem := self._journal.problem) is not None:
-            self._sender.warn_once("disk", f"MLflow's points cannot be kept on disk at {problem}")
+            self._sender.warn_once("disk", f"MLflow's points wait in memory, the disk takes none now: {problem}")
 
 
 @dataclass(frozen=True)
@@ -172,7 +166,7 @@ class NewRun:
 def start_run(address: str, new: NewRun, *, offline: bool | None = None, **options: Any) -> TrackedRun:
     """Begin a run; with `offline` although the store does not answer (None: as `AVP_MLFLOW_OFFLINE` says).
 
-    The options are those of `Sender`, also below.
+    Options are those of `Sender`, as for the other ways to open a run.
 
     Raises:
         TrackingError: the store cannot be reached, or refuses.
@@ -187,12 +181,11 @@ def start_run(address: str, new: NewRun, *, offline: bool | None = None, **optio
         "name": new.name,
         "tags": resolve_tags() | dict(new.tags),
         "parent": new.parent,
-        "creating": True,
     }
     journal = Journal.create(header)
     if client is not None:
         try:
-            journal.update({"run_id": create_run(client, header | {"creating": False})})
+            journal.update({"run_id": create_run(client, header)})
         except Exception as error:
             journal.remove()
             if isinstance(error, AVPError):

@@ -73,7 +73,7 @@ _ALWAYS = json.loads("""{
 
 
 @dataclass(frozen=True)
-class View:
+class RunsView:
     """A view of the runs page.
 
     `key` names it in addresses, `title` in the page's menu; `runs` is MLflow's filter of the runs that it shows.
@@ -120,7 +120,7 @@ def _column(name: str) -> str:
 
 _COMPARED = "eval/psnr eval/views eval/coverage eval/visibility eval/ssim eval/lpips"
 _COURSE = "avp/coverage avp/views avp/cpv rollout/ep_rew_mean avp/stop_share avp/redundant_views"
-RECONSTRUCTIONS = View(
+RECONSTRUCTIONS = RunsView(
     key="avp-reconstructions",
     title="Reconstructions by policy",
     runs="metrics.`eval/psnr` > -1000",
@@ -131,7 +131,7 @@ RECONSTRUCTIONS = View(
         "A bar per run": list(map(_bar, _COMPARED.split())),
     },
 )
-EVALUATIONS = View(
+EVALUATIONS = RunsView(
     key="avp-evaluations",
     title="Evaluations by policy",
     runs="metrics.`eval/curve` >= 0",
@@ -142,7 +142,7 @@ EVALUATIONS = View(
         "A bar per policy": [_bar("eval/coverage"), _bar("eval/views"), _bar("eval/cpv")],
     },
 )
-TRAININGS = View(
+TRAININGS = RunsView(
     key="avp-trainings",
     title="Trainings by environment step",
     runs="metrics.`avp/coverage` >= 0",
@@ -157,7 +157,7 @@ VIEWS = (RECONSTRUCTIONS, EVALUATIONS, TRAININGS)
 """In the order of the page's menu."""
 
 
-def path_of(experiment_id: str, view: View = RECONSTRUCTIONS, *, charts: bool = False) -> str:
+def path_of(experiment_id: str, view: RunsView = RECONSTRUCTIONS, *, charts: bool = False) -> str:
     """What follows the server's address, to open a view as a table or as `charts`."""
     mode = "&compareRunsMode=CHART" if charts else ""
     return f"#/experiments/{experiment_id}/runs?{MODEL_TRAINING}&viewStateShareKey={view.key}{mode}"

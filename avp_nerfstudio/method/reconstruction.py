@@ -44,7 +44,7 @@ from avp_nerfstudio.method.scores import heldout_count, mean_scores, optional_lp
 from avp_nerfstudio.tracking.mlflow import facts_of, open_again
 
 if TYPE_CHECKING:
-    from avp_nerfstudio.reconstruct import Reconstruction
+    from avp_nerfstudio.reconstruct import Reconstruct
 
 _NEVER = 1 << 40
 _OUTPUTS = "nerfstudio"
@@ -52,7 +52,7 @@ _PACKAGES = ("avp-suite", "nerfstudio", "torch", "torchvision", "torchmetrics", 
 
 
 def process(
-    options: "Reconstruction", rollout: Rollout, folder: Path, *, started: float, address: str | None
+    options: "Reconstruct", rollout: Rollout, folder: Path, *, started: float, address: str | None
 ) -> dict[str, Any]:
     """Train, score, and write everything of the folder.
 
@@ -114,7 +114,7 @@ def process(
     return found
 
 
-def _configuration(options: "Reconstruction", rollout: Rollout, outputs: Path) -> Any:
+def _configuration(options: "Reconstruct", rollout: Rollout, outputs: Path) -> Any:
     """The `TrainerConfig` of a training that writes to a folder `outputs`."""
     config: Any = trainer_config() if options.method == "avp-nerfacto" else _nerfacto()
     manager = config.pipeline.datamanager

@@ -100,7 +100,7 @@ class EvaluationCallback(BaseCallback):
         self._every, self._episodes, self._seed = every, episodes, seed
         self._deterministic, self._at_start, self._score = deterministic, at_start, score
         self._settings = settings
-        self._choice = SimulatorChoice(simulator, gpu=gpu, navmesh=navmesh and Path(navmesh), up=up)
+        self._choice = SimulatorChoice(simulator, gpu=gpu, navmesh=Path(navmesh) if navmesh else None, up=up)
         self._best = BestModel(best_model, score)
         self._due = 0
         self._evaluated_at: int | None = None

@@ -73,7 +73,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, type) or not callable(value):
         return getattr(value, "__name__", value)
     try:
-        start, end = float(value(1.0)), float(value(0.0))
+        start, end = (float(value(progress)) for progress in (1.0, 0.0))  # type: ignore[arg-type]
     except (TypeError, ValueError):
         return getattr(value, "__name__", type(value).__name__)
     return start if start == end else f"{start:g} -> {end:g}"

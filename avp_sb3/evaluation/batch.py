@@ -39,7 +39,8 @@ def check_fit(model: BaseAlgorithm, training: VecEnv, env: VecEnv) -> None:
     normalised, own = model.get_vec_normalize_env(), unwrap_vec_normalize(env)
     if own is not None and normalised is None:
         raise UsageError(f"{READER} eval_env: is wrapped in VecNormalize, but the training's environment is not")
-    seen = model.observation_space if own is not None or normalised is None else normalised.venv.observation_space
+    raw = None if normalised is None or own is not None else normalised.venv
+    seen = model.observation_space if raw is None else raw.observation_space
     for kind, expected in (("observation_space", seen), ("action_space", model.action_space)):
         if expected != getattr(env, kind):
             raise UsageError(
@@ -114,7 +115,8 @@ def run_batch(
         The episodes by scene (`scenes_of`), sorted by environment.
     """
     scenes = scenes_of(env)
-    wanted, seeds = np.zeros(env.num_envs, dtype=np.int64), [0] * env.num_envs
+    wanted = np.zeros(env.num_envs, dtype=np.int64)
+    seeds: list[int | None] = [None] * env.num_envs
     for agents in scenes.values():
         for place, agent in enumerate(agents):
             wanted[agent] = (episodes + len(agents) - 1 - place) // len(agents)
@@ -126,7 +128,7 @@ def run_batch(
     returned = np.zeros(env.num_envs)
     with _normalised(model, env) as normalise:
         env.seed(seed)
-        env.unwrapped._seeds = seeds  # Other starts than seed, seed + 1, … over all scenes.
+        env.unwrapped._seeds = [*seeds]  # Other starts than seed, seed + 1, … over all scenes.
         observation, state, starts = normalise(env.reset()), None, np.ones(env.num_envs, dtype=np.bool_)
         while wanted.any():
             actions, state = model.predict(observation, state, starts, deterministic=deterministic)  # type: ignore[arg-type]

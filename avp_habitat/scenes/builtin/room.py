@@ -25,14 +25,7 @@ _OFF_THE_GRID = 3.7e-5
 
 
 def plan_room(seed: int) -> tuple[Kit, Shell, list[Placed]]:
-    """What a room is made of, the empty room and its furniture, before light is baked.
-
-    Args:
-        seed: 0 or greater.
-
-    Raises:
-        UsageError: the seed is not a whole number of 0 or greater.
-    """
+    """What a room is made of, the empty room and its furniture, before light is baked; errors as of `generate_room`."""
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise UsageError(f"builtin:{seed}: expected a whole number of 0 or greater as the room's seed, got {seed!r}")
     seed = int(seed)

@@ -106,11 +106,11 @@ def panel(
 
     Args:
         corner: upper left corner as seen from the front.
-        right: edge from the left to the right.
-        down: edge from the upper to the lower side.
-        material: of the rectangle.
+        right: edge from there to the right.
+        down: edge from there downwards.
+        material: whose picture measures metres along `right` and `down`, from `origin` on.
         pitch: largest distance between vertices.
-        fit: texture rectangle (u0, v0, u1, v1) to stretch over it instead of measuring in metres.
+        fit: part of the picture (u0, v0, u1, v1) to stretch over the rectangle instead.
         turned: let u of the picture run downwards.
         origin: how far along right and down the picture starts.
         holes: rectangles (right0, down0, right1, down1) that are left out.
@@ -122,9 +122,9 @@ def panel(
     points = start + (s / width)[None, :, None] * across + (t / height)[:, None, None] * fall
     if fit is not None:
         u, v = fit[0] + (fit[2] - fit[0]) * s / width, fit[1] + (fit[3] - fit[1]) * t / height
-        grid_v, grid_u = np.meshgrid(v, u, indexing="ij")
+        grid_u, grid_v = np.meshgrid(u, v)
     else:
-        grid_v, grid_u = np.meshgrid(t + origin[1], s + origin[0], indexing="ij")
+        grid_u, grid_v = np.meshgrid(s + origin[0], t + origin[1])
         if turned:
             grid_u, grid_v = grid_v, grid_u
         grid_u, grid_v = grid_u / material.width_m, grid_v / material.height_m
