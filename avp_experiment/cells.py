@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from avp_experiment.configuration import TRAIN as TRAIN_SCENE
-from avp_experiment.configuration import Configuration, Method, Scene, scene_slug
+from avp_experiment.configuration import Configuration, ExperimentScene, Method, scene_slug
 from avp_habitat.errors import AVPError
 from avp_habitat.task.rewards import find_reward, needs_surface
 
@@ -38,7 +38,7 @@ class Cell:
     method: Method
     seed: int
     """Of the training, and of the starts."""
-    scene: Scene | None = None
+    scene: ExperimentScene | None = None
     """None for a training."""
     start: int = 0
     """Number of the episode within its seed."""
@@ -104,7 +104,7 @@ class _Planner:
         words += ["--experiment", self.tracking, "--run-name", f"{method.name} (seed {seed})"]
         return Cell(TRAIN, name, tuple(words), method, seed)
 
-    def rollout(self, method: Method, seed: int, scene: Scene, start: int, training: Cell | None) -> Cell:
+    def rollout(self, method: Method, seed: int, scene: ExperimentScene, start: int, training: Cell | None) -> Cell:
         preset, (width, height) = self.configuration.preset, self.configuration.preset.size
         policy = (
             ["--policy", str(training.output(self.root)), "--stochastic"] if training else ["--policy", method.spec]

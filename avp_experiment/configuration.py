@@ -83,7 +83,7 @@ def _placed(name: str) -> Method:
 
 
 @dataclass(frozen=True)
-class Preset:
+class ExperimentPreset:
     """Everything about an experiment but its scenes, methods and simulator."""
 
     steps: int
@@ -113,18 +113,18 @@ class Preset:
 
 
 PRESETS = {
-    "demo": Preset(300_000, 300_000, seeds=1, rooms=2, size=(192, 144), iterations=1000, prefixes=()),
-    "smoke": Preset(24_576, 24_576, seeds=1, rooms=2, size=(96, 72), iterations=100, prefixes=(40,)),
-    "cpu": Preset(700_000, 700_000, size=(192, 144), iterations=300, prefixes=(20, 40)),
-    "gpu": Preset(1_000_000, 2_000_000, starts=3),
-    "paper": Preset(300_000, 300_000, observation="numbers", reconstruction="nerfacto"),
+    "demo": ExperimentPreset(300_000, 300_000, seeds=1, rooms=2, size=(192, 144), iterations=1000, prefixes=()),
+    "smoke": ExperimentPreset(24_576, 24_576, seeds=1, rooms=2, size=(96, 72), iterations=100, prefixes=(40,)),
+    "cpu": ExperimentPreset(700_000, 700_000, size=(192, 144), iterations=300, prefixes=(20, 40)),
+    "gpu": ExperimentPreset(1_000_000, 2_000_000, starts=3),
+    "paper": ExperimentPreset(300_000, 300_000, observation="numbers", reconstruction="nerfacto"),
 }
 """demo: one good training, no curves (`make demo`). smoke: minutes, to see that everything works. cpu: two to three
 hours on two cores. gpu: the same questions at full size. paper: the paper's observation, steps and reconstruction."""
 
 
 @dataclass(frozen=True)
-class Scene:
+class ExperimentScene:
     """A scene of the experiment."""
 
     spec: str
@@ -146,9 +146,9 @@ class Configuration:
     """An experiment."""
 
     preset_name: str
-    preset: Preset
+    preset: ExperimentPreset
     """Its values, some of them perhaps replaced by the user."""
-    scenes: tuple[Scene, ...]
+    scenes: tuple[ExperimentScene, ...]
     """Of training first, then unseen ones."""
     methods: tuple[Method, ...]
     metrics: tuple[str, ...] = ()
@@ -180,7 +180,7 @@ class Configuration:
         return {"preset": self.preset_name, **values, "simulator": self.simulator, "scenes": scenes}
 
 
-def read_scenes(train: Sequence[str], unseen: Sequence[str], choice: SimulatorChoice) -> tuple[Scene, ...]:
+def read_scenes(train: Sequence[str], unseen: Sequence[str], choice: SimulatorChoice) -> tuple[ExperimentScene, ...]:
     """Open every scene once, so that one that cannot be used is named before anything long begins.
 
     Raises:
@@ -189,12 +189,12 @@ def read_scenes(train: Sequence[str], unseen: Sequence[str], choice: SimulatorCh
     """
     if not train:
         raise UsageError("scene: expected at least one scene of training, got none")
-    found: list[Scene] = []
+    found: list[ExperimentScene] = []
     for role, specs in ((TRAIN, train), (UNSEEN, unseen)):
         for spec in specs:
             opened = open_simulator(choice, spec)
             _ = opened.area
-            scene = Scene(spec, opened.scene, opened.scene_digest, role)
+            scene = ExperimentScene(spec, opened.scene, opened.scene_digest, role)
             opened.close()
             for other in found:
                 if scene.sha256 == other.sha256:

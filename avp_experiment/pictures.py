@@ -8,7 +8,7 @@ import numpy as np
 
 from avp_experiment.configuration import TRAIN, UNSEEN, scene_slug
 from avp_experiment.plots import WIDTH_IN, Drawn, Missing, new_figure
-from avp_experiment.results import PICTURES, Episode, Results, floor_of
+from avp_experiment.results import PICTURES, EpisodeResult, Results, floor_of
 from avp_habitat.metrics import FIGURES
 from avp_habitat.poses import heading
 from avp_habitat.rollout.images import read_rgb
@@ -98,7 +98,7 @@ def same_views(results: Results, role: str) -> Drawn:
     return Drawn(picture, caption + (f" Not shown: {', '.join(left_out)}." if left_out else ""))
 
 
-def _draw_map(axes: "Axes", rollout: Episode, numbers: np.ndarray, last: int) -> Any:
+def _draw_map(axes: "Axes", rollout: EpisodeResult, numbers: np.ndarray, last: int) -> Any:
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
 

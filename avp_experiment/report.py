@@ -130,7 +130,7 @@ def _origin(results: Results) -> str:
 
 
 @dataclass(frozen=True)
-class Report:
+class ReportOptions:
     """Make every table and figure of an experiment from its results.json, and the page that holds them, results.md.
 
     A file reading.md beside them, written by hand, becomes a part of the page. What cannot be made is left out; the
@@ -143,8 +143,8 @@ class Report:
     """Methods of figure 5."""
 
 
-def main(options: Report) -> None:
-    """Report."""
+def main(options: ReportOptions) -> None:
+    """Make the tables and figures again."""
     if options.maps != DEFAULT_MAPS:
         known = read_results(options.folder).methods
         for name in options.maps:

@@ -43,7 +43,7 @@ class _Measured:
 
 
 @dataclass(frozen=True)
-class Episode(_Measured):
+class EpisodeResult(_Measured):
     """One rollout."""
 
     metrics: Mapping[str, float]
@@ -95,7 +95,7 @@ class Results:
     origin: Mapping[str, Any]
     """Command, commits, machine, versions."""
     training: tuple[Training, ...]
-    rollouts: tuple[Episode, ...]
+    rollouts: tuple[EpisodeResult, ...]
     reconstructions: tuple[Reconstruction, ...]
     failed: tuple[Mapping[str, str], ...]
     """`cell`, `reason` and `log` (relative to the folder) of what was tried in vain."""
@@ -195,9 +195,9 @@ def _numbers(entry: Any) -> dict[str, float]:
     return {name: float(number) for name, number in entry.items() if isinstance(number, int | float)}
 
 
-def _episode(entry: Any) -> Episode:
+def _episode(entry: Any) -> EpisodeResult:
     curve = tuple(float(share) for share in entry["coverage_curve"])
-    return Episode(*_measured(entry), _numbers(entry["metrics"]), curve, entry.get("map"))
+    return EpisodeResult(*_measured(entry), _numbers(entry["metrics"]), curve, entry.get("map"))
 
 
 def _reconstruction(entry: Any) -> Reconstruction:

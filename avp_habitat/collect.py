@@ -13,7 +13,6 @@ from avp_habitat import command
 from avp_habitat.command import progress
 from avp_habitat.errors import RolloutError
 from avp_habitat.files import check_writable
-from avp_habitat.gpu import nerfacto_line
 from avp_habitat.metrics import METRICS_HELP
 from avp_habitat.plugins import name_of
 from avp_habitat.policies.registry import (
@@ -25,6 +24,7 @@ from avp_habitat.policies.registry import (
     steps_of,
 )
 from avp_habitat.poses import Intrinsics
+from avp_habitat.provenance import nerfacto_line
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.capture import VIEWS, capture_heldout, capture_step, publish_rollout
 from avp_habitat.rollout.writing import RolloutWriter

@@ -1,5 +1,6 @@
-"""Versions of Python and of installed packages, for whoever has to say what made a result."""
+"""What made a result: versions, commit, and whether this machine has a GPU."""
 
+import ctypes
 import platform
 import subprocess
 from collections.abc import Iterable, Mapping
@@ -55,3 +56,32 @@ def version_of(distribution: str) -> str | None:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:
         return None
+
+
+WITHOUT_GPU = "--machine.device-type cpu --pipeline.model.implementation torch --mixed-precision False"
+"""Options with which nerfstudio's own methods run on a CPU; `avp-nerfacto` chooses by itself."""
+
+
+def has_cuda() -> bool:
+    """Whether torch, as it is installed, would find a CUDA device: asks NVIDIA's driver, in milliseconds."""
+    try:
+        if metadata.version("torch").endswith("+cpu"):
+            return False
+    except metadata.PackageNotFoundError:
+        pass
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+        count = ctypes.c_int(0)
+        return driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0 and count.value > 0
+    except (OSError, AttributeError):
+        return False
+
+
+def nerfacto_line(data: str) -> str:
+    """The command line that trains plain nerfacto on a rollout on this machine.
+
+    Args:
+        data: the rollout's folder, quoted for a shell.
+    """
+    options = "" if has_cuda() else f"{WITHOUT_GPU} "
+    return f"ns-train nerfacto {options}avp-data --data {data}"

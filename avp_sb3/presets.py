@@ -5,7 +5,7 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Preset:
+class PPOPreset:
     """Arguments of PPO, and how many agents share its buffer."""
 
     n_envs: int
@@ -47,9 +47,9 @@ class Preset:
         return settings
 
 
-TABLE_4 = Preset(n_envs=64, n_steps=32, batch_size=512, n_epochs=10, learning_rate=3e-4, linear=False, ent_coef=0.02)
+TABLE_4 = PPOPreset(n_envs=64, n_steps=32, batch_size=512, n_epochs=10, learning_rate=3e-4, linear=False, ent_coef=0.02)
 """Table 4 of the paper: a buffer of 2048 steps, here of 64 agents."""
-MAP = Preset(n_envs=64, n_steps=128, batch_size=1024, n_epochs=6, learning_rate=5e-4, linear=True, ent_coef=0.01)
+MAP = PPOPreset(n_envs=64, n_steps=128, batch_size=1024, n_epochs=6, learning_rate=5e-4, linear=True, ent_coef=0.01)
 """For the map: a larger buffer and fewer passes; chosen after a few trials on white_room (docs/training.md)."""
 PRESETS = {"numbers": TABLE_4, "map": MAP, "surface_map": MAP}
 """By kind of observation."""

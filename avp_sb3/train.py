@@ -21,7 +21,7 @@ from avp_habitat.simulators.registry import SimulatorChoice
 from avp_habitat.task.rewards import REWARDS_HELP
 from avp_habitat.task.settings import OBSERVATIONS_HELP, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
-from avp_sb3.presets import MAP, PRESETS, Preset
+from avp_sb3.presets import MAP, PRESETS, PPOPreset
 
 _MLFLOW = "runs:/"
 _MOST = 1e12
@@ -75,7 +75,7 @@ class Train:
         _ = self.settings, self.preset
 
     @property
-    def preset(self) -> Preset:
+    def preset(self) -> PPOPreset:
         """PPO's settings; the buffer is shared by as many agents as asked for."""
         preset = PRESETS.get(self.observation, MAP)
         buffer = preset.n_envs * preset.n_steps

@@ -6,14 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from avp_experiment.cells import COLLECT, plan
-from avp_experiment.configuration import PRESETS, Configuration, Scene, chosen_methods
+from avp_experiment.configuration import PRESETS, Configuration, ExperimentScene, chosen_methods
 from avp_experiment.folder import Folder
 from avp_experiment.runner import Runner, environment
 
 
 def rollouts(root):
     preset = replace(PRESETS["smoke"], budget=3, size=(32, 24), starts=3, prefixes=())
-    scenes = (Scene("builtin:0", "builtin:0", "00", "train"),)
+    scenes = (ExperimentScene("builtin:0", "builtin:0", "00", "train"),)
     configuration = Configuration("smoke", preset, scenes, chosen_methods(["heuristic", "random"]))
     return [cell for cell in plan(configuration, root, tracking="avp") if cell.kind == COLLECT]
 

@@ -14,8 +14,8 @@ from stable_baselines3 import PPO
 
 from avp_habitat import command
 from avp_habitat.collect import main
-from avp_habitat.gpu import nerfacto_line
 from avp_habitat.metrics import nearest_neighbour_distance
+from avp_habitat.provenance import nerfacto_line
 from avp_habitat.rollout import images
 from avp_habitat.rollout.format import read_rollout
 from avp_habitat.task.env import AVPEnv

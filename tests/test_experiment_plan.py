@@ -8,12 +8,12 @@ import pytest
 
 from avp_experiment import compare
 from avp_experiment.cells import COLLECT, RECONSTRUCT, TRAIN, plan
-from avp_experiment.configuration import DEFAULT, PRESETS, Configuration, Scene, chosen_methods, known_methods
+from avp_experiment.configuration import DEFAULT, PRESETS, Configuration, ExperimentScene, chosen_methods, known_methods
 from avp_experiment.folder import Folder, open_folder
 from avp_experiment.plots import style_of
 from avp_habitat import command
 
-SCENES = (Scene("a.glb", "a.glb", "11", "train"), Scene("dir/b.glb", "b.glb", "22", "unseen"))
+SCENES = (ExperimentScene("a.glb", "a.glb", "11", "train"), ExperimentScene("dir/b.glb", "b.glb", "22", "unseen"))
 
 
 def configuration(methods=("heuristic", "coverage", "proposed_rooms"), seeds=2, **changes):
@@ -108,7 +108,7 @@ def test_a_policy_is_trained_in_the_scenes_of_training_or_in_rooms_and_never_in_
 
 def test_a_scene_of_the_experiment_is_no_room_of_training():
     taken = configuration().rooms[1]
-    scenes = (Scene(taken, taken, "33", "unseen"), *SCENES)
+    scenes = (ExperimentScene(taken, taken, "33", "unseen"), *SCENES)
     rooms = replace(configuration(), scenes=scenes).rooms
     assert taken not in rooms
     assert len(rooms) == 3

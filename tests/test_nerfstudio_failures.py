@@ -9,7 +9,7 @@ import torch
 from nerfstudio_room import write_room
 from nerfstudio_shell import Shell
 
-from avp_habitat import gpu
+from avp_habitat import provenance
 
 pytest.importorskip("nerfstudio")
 
@@ -59,7 +59,7 @@ def test_a_training_for_a_gpu_that_is_not_there_names_commands_that_work_here(sh
     assert line.startswith(f"error: {method} is to train on a GPU, and none was found here (torch ")
     ours, plain = commands(line)
     assert ours == ["ns-train", "avp-nerfacto", "--data", f"{place}/runs/r0"]
-    assert plain == ["ns-train", method, *gpu.WITHOUT_GPU.split(), "avp-data", "--data", f"{place}/runs/r0"]
+    assert plain == ["ns-train", method, *provenance.WITHOUT_GPU.split(), "avp-data", "--data", f"{place}/runs/r0"]
     assert list(tmp_path.iterdir()) == []
 
 

@@ -5,7 +5,7 @@ import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv
 from tracking import SmallEnv, mlflow_home, ppo
 
-from avp_habitat import command, gpu, metrics
+from avp_habitat import command, metrics, provenance
 from avp_sb3 import EvaluationCallback, MetricsCallback, MLflowCallback, RerunCallback
 
 
@@ -74,18 +74,18 @@ def test_callbacks_that_are_to_be_silent_print_nothing(tmp_path, monkeypatch, ca
 
 
 def test_plain_nerfacto_is_told_to_use_the_cpu_where_there_is_no_gpu(monkeypatch):
-    monkeypatch.setattr(gpu, "has_cuda", lambda: False)
-    assert gpu.nerfacto_line("'my r'") == (
+    monkeypatch.setattr(provenance, "has_cuda", lambda: False)
+    assert provenance.nerfacto_line("'my r'") == (
         "ns-train nerfacto --machine.device-type cpu --pipeline.model.implementation torch --mixed-precision False "
         "avp-data --data 'my r'"
     )
-    monkeypatch.setattr(gpu, "has_cuda", lambda: True)
-    assert gpu.nerfacto_line("r") == "ns-train nerfacto avp-data --data r"
+    monkeypatch.setattr(provenance, "has_cuda", lambda: True)
+    assert provenance.nerfacto_line("r") == "ns-train nerfacto avp-data --data r"
 
 
 def test_a_gpu_is_found_where_torch_finds_one():
     torch = pytest.importorskip("torch")
-    assert gpu.has_cuda() == torch.cuda.is_available()
+    assert provenance.has_cuda() == torch.cuda.is_available()
 
 
 def test_terms_are_explained_by_name():

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles, check_memory, decode_picture
-from avp_habitat.scenes.gltf_materials import SUPPORTED, Surface, ignored, surface_of
+from avp_habitat.scenes.gltf_materials import SUPPORTED, GltfSurface, ignored, surface_of
 from avp_habitat.scenes.mesh import TexturedMesh, merge, only, warn_once, with_mask
 
 _COMPONENT = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -268,7 +268,7 @@ class _Reader:
             triangles[1::2] = triangles[1::2][:, [1, 0, 2]]
         return triangles
 
-    def _coordinates(self, attributes: Any, surface: Surface, vertices: int) -> NDArray[np.float32] | None:
+    def _coordinates(self, attributes: Any, surface: GltfSurface, vertices: int) -> NDArray[np.float32] | None:
         accessor = None if surface.texture is None else getattr(attributes, surface.coordinates, None)
         if accessor is None or surface.texture is None:
             return None
@@ -282,7 +282,7 @@ class _Reader:
             warn_once(str(self._path), "textures that are clamped or mirrored beyond their edges are repeated there")
         return uv
 
-    def _colours(self, attributes: Any, surface: Surface, vertices: int) -> NDArray[np.float32]:
+    def _colours(self, attributes: Any, surface: GltfSurface, vertices: int) -> NDArray[np.float32]:
         """`(v, 4)` colours and alpha; integers count as fractions even where a file forgets to say so."""
         colours = np.broadcast_to(surface.factor, (vertices, 4)).copy()
         if attributes.COLOR_0 is not None:

@@ -34,7 +34,7 @@ _NAMED = 4
 
 
 @dataclass(frozen=True)
-class Surface:
+class GltfSurface:
     """What a material says."""
 
     factor: NDArray[np.float32]
@@ -50,7 +50,7 @@ class Surface:
     """Whether vertex colours multiply it; they do not where it is light that shows."""
 
 
-def surface_of(material: pygltflib.Material | None) -> Surface:
+def surface_of(material: pygltflib.Material | None) -> GltfSurface:
     """The colour that a material shows without any light, and its mask.
 
     That is the base colour, or the diffuse colour of KHR_materials_pbrSpecularGlossiness. Of a material whose colour is
@@ -58,7 +58,7 @@ def surface_of(material: pygltflib.Material | None) -> Surface:
     picture and no other, or with an emissive colour and a white base.
     """
     if material is None:
-        return Surface(np.ones(4, np.float32))
+        return GltfSurface(np.ones(4, np.float32))
     extensions = material.extensions or {}
     base = material.pbrMetallicRoughness
     factor, info = (base.baseColorFactor, base.baseColorTexture) if base else (None, None)
@@ -116,15 +116,15 @@ def _is_light(colour: NDArray, info: Any, light: NDArray, picture: Any) -> bool:
     return bool(light.any()) and bool(dark or (info is None and (picture is not None or white)))
 
 
-def _textured(factor: NDArray, info: Any, cutoff: float | None, *, tinted: bool = True) -> Surface:
+def _textured(factor: NDArray, info: Any, cutoff: float | None, *, tinted: bool = True) -> GltfSurface:
     """A surface with a texture info, which extensions hold as a dictionary."""
     entry = info if isinstance(info, Mapping) else vars(info) if info is not None else {}
     if entry.get("index") is None:
-        return Surface(factor, cutoff=cutoff, tinted=tinted)
+        return GltfSurface(factor, cutoff=cutoff, tinted=tinted)
     moved = (entry.get("extensions") or {}).get("KHR_texture_transform")
     channel = (moved or {}).get("texCoord", entry.get("texCoord") or 0)
     transform = None if moved is None else _uv_transform(moved)
-    return Surface(factor, entry["index"], f"TEXCOORD_{channel}", transform, cutoff, tinted)
+    return GltfSurface(factor, entry["index"], f"TEXCOORD_{channel}", transform, cutoff, tinted)
 
 
 def _uv_transform(entry: dict[str, Any]) -> NDArray[np.float32]:

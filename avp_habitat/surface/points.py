@@ -27,7 +27,7 @@ _BEFORE_M = 0.01
 
 
 @dataclass(frozen=True)
-class View:
+class SampledView:
     """A depth image that looks from some place in some direction."""
 
     place: NDArray[np.float64]
@@ -50,7 +50,7 @@ class SceneSurface:
     """`(m, 3)` unit vectors out of the surface, to the side from which it was seen."""
 
 
-def views_all_over(simulator: Simulator, settings: TaskSettings) -> Iterator[View]:
+def views_all_over(simulator: Simulator, settings: TaskSettings) -> Iterator[SampledView]:
     """What is seen all around from places all over the floor, the same ones every time.
 
     Args:
@@ -65,7 +65,7 @@ def views_all_over(simulator: Simulator, settings: TaskSettings) -> Iterator[Vie
         depth = simulator.render(pose, _CAMERA, rgb=False).depth
         for each, image in zip(pose, depth, strict=True):
             hit = (image > 0) & (image <= settings.max_range_m)
-            yield View(place, each, np.asarray(unproject(image, each, _CAMERA), dtype=np.float64), hit)
+            yield SampledView(place, each, np.asarray(unproject(image, each, _CAMERA), dtype=np.float64), hit)
 
 
 def scene_surface(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
@@ -95,7 +95,7 @@ def _find(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
     return SceneSurface(np.ascontiguousarray(rows[:, :3]), np.ascontiguousarray(rows[:, 3:6]))
 
 
-def _normals(view: View, eye: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _normals(view: SampledView, eye: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """`(height, width, 3)` unit normals towards the camera, and where the surface is flat enough to have one."""
     points, middle = view.points, view.points[1:-1, 1:-1]
     neighbours = (points[1:-1, 2:], points[1:-1, :-2], points[2:, 1:-1], points[:-2, 1:-1])

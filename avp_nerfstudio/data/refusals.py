@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from avp_habitat.errors import AVPError, RolloutError
-from avp_habitat.gpu import WITHOUT_GPU
+from avp_habitat.provenance import WITHOUT_GPU
 
 # What each tool leaves in a folder (all of the patterns match something), what it is, and what reads it: a parser of
 # `ns-train METHOD PARSER` with its options, a converter of `ns-process-data CONVERTER`, or a sentence.

@@ -116,7 +116,7 @@ class Block:
         return Block(self.x0, self.z0, self.x1, self.z1)
 
 
-class Floor:
+class FloorPlan:
     """A room that fills with furniture."""
 
     def __init__(self, shell: Shell) -> None:
@@ -215,7 +215,7 @@ def stand_at(member: Member, wall: Wall, right: float, inwards: float) -> Placed
     return Placed(member.piece, axes, (x, z), footprint)
 
 
-def _hang_one(floor: Floor, rng: Random, kit: Kit, wall: Wall, right: float, *, clock: bool) -> bool:
+def _hang_one(floor: FloorPlan, rng: Random, kit: Kit, wall: Wall, right: float, *, clock: bool) -> bool:
     """Hang a picture or clock at a place on a wall if nothing is in its way."""
     width, height = (0.34, 0.34) if clock else rng.choice(_PICTURES)
     low, high = _MIDDLE_M - height / 2, _MIDDLE_M + height / 2
@@ -229,7 +229,7 @@ def _hang_one(floor: Floor, rng: Random, kit: Kit, wall: Wall, right: float, *, 
     return True
 
 
-def _hang_pictures(floor: Floor, rng: Random, kit: Kit) -> None:
+def _hang_pictures(floor: FloorPlan, rng: Random, kit: Kit) -> None:
     """Pictures on every wall that has room for them, one clock in some rooms."""
     clock = rng.chance(0.6)
     for wall in rng.shuffled(floor.shell.walls):
@@ -239,7 +239,7 @@ def _hang_pictures(floor: Floor, rng: Random, kit: Kit) -> None:
                 wanted, clock = wanted - 1, False
 
 
-def _hang_lamp(floor: Floor, rng: Random, kit: Kit) -> None:
+def _hang_lamp(floor: FloorPlan, rng: Random, kit: Kit) -> None:
     """A pendant above the dining table, or where the room is open."""
     ceiling, (x0, z0, x1, z1) = floor.shell.ceiling, floor.shell.bounds
     tables = [stand.position for stand in floor.placed if stand.piece.kind == "dining table"]
@@ -253,7 +253,7 @@ def _hang_lamp(floor: Floor, rng: Random, kit: Kit) -> None:
             return
 
 
-def _put(floor: Floor, rng: Random, arrange: Arrange, spots: _Spots, least_share: float) -> bool:
+def _put(floor: FloorPlan, rng: Random, arrange: Arrange, spots: _Spots, least_share: float) -> bool:
     """Place a group at the first spot, in random order, where it fits and leaves enough of the floor walkable."""
     for wall in rng.shuffled([wall for wall in floor.shell.walls if spots(wall)]):
         for right, inwards in rng.shuffled(spots(wall))[:_MOST_SPOTS]:
@@ -289,12 +289,12 @@ def _storage(kit: Kit, rng: Random) -> list[Arrange]:
     return rng.shuffled(first) + second
 
 
-def _put_living(floor: Floor, rng: Random, kit: Kit) -> bool:
+def _put_living(floor: FloorPlan, rng: Random, kit: Kit) -> bool:
     """Sofa, television and what belongs to them, as much as fits."""
     return any(_put(floor, rng, arrange, _at_wall, _MAIN) for arrange in groups.living(kit, rng))
 
 
-def _put_main_groups(floor: Floor, rng: Random, kit: Kit) -> None:
+def _put_main_groups(floor: FloorPlan, rng: Random, kit: Kit) -> None:
     """What the room is for, by its size, and what parts it."""
     area = floor.shell.floor_area
     sleeps = rng.chance(0.6 if area > 22 else 0.4)
@@ -308,7 +308,7 @@ def _put_main_groups(floor: Floor, rng: Random, kit: Kit) -> None:
     any(_put(floor, rng, arrange, _across, _MAIN) for arrange in groups.divider(kit, rng, floor.shell.ceiling))
 
 
-def _put_the_rest(floor: Floor, rng: Random, kit: Kit) -> None:
+def _put_the_rest(floor: FloorPlan, rng: Random, kit: Kit) -> None:
     """Desk, storage, a place to read, and what fills corners, as long as the floor stays walkable."""
     first, *rest = _storage(kit, rng)
     for arrange in (groups.working(kit, rng), first):
@@ -324,7 +324,7 @@ def _put_the_rest(floor: Floor, rng: Random, kit: Kit) -> None:
 
 def furnish(shell: Shell, rng: Random, kit: Kit) -> list[Placed]:
     """Furniture of a room, none of it in another's place, the door free, the floor walkable and in one part."""
-    floor = Floor(shell)
+    floor = FloorPlan(shell)
     _put_main_groups(floor, rng, kit)
     _put_the_rest(floor, rng, kit)
     _hang_lamp(floor, rng, kit)
