@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from avp_habitat.navigation.area import NavigableArea
     from avp_habitat.scenes.loader import Scene
     from avp_habitat.scenes.mesh import TexturedMesh
-    from avp_habitat.simulators.shading import ShadedSurface
+    from avp_habitat.simulators.shading import Surface
 
 _RAYS_PER_CALL = 1 << 20
 _BEYOND_M = np.float32(1e-4)
@@ -71,7 +71,7 @@ class RaycastSimulator:
         return area_of_file(self._navmesh, own, self.surface_below, bounds)
 
     @cached_property
-    def _surface(self) -> "ShadedSurface":
+    def _surface(self) -> "Surface":
         from avp_habitat.simulators.shading import pack_surface
 
         return pack_surface(self._mesh)

@@ -15,7 +15,7 @@ _MAX_PROBES = 8
 _PIXELS_PER_TASK = 1 << 15
 
 
-class ShadedSurface(NamedTuple):
+class Surface(NamedTuple):
     """A textured mesh as flat arrays for the compiled kernel; all textures' pyramids lie one after the other."""
 
     vertices: NDArray[np.float32]
@@ -53,7 +53,7 @@ class Hits(NamedTuple):
     """`(n, 3)` change of the direction from one pixel to the next below."""
 
 
-def pack_surface(mesh: TexturedMesh) -> ShadedSurface:
+def pack_surface(mesh: TexturedMesh) -> Surface:
     """The arrays that `shade` reads, with a pyramid of halved pictures for every texture."""
     pyramids = [_pyramid(texture) for texture in mesh.textures]
     levels, offset = [], 0
@@ -61,7 +61,7 @@ def pack_surface(mesh: TexturedMesh) -> ShadedSurface:
         levels.append((offset, level.shape[1], level.shape[0]))
         offset += level.shape[0] * level.shape[1]
     flat = [_packed(level) for pyramid in pyramids for level in pyramid]
-    return ShadedSurface(
+    return Surface(
         np.ascontiguousarray(mesh.vertices, np.float32),
         np.ascontiguousarray(mesh.triangles, np.int32).view(np.uint32),
         np.ascontiguousarray(mesh.uv, np.float32),
@@ -91,7 +91,7 @@ def _pyramid(texture: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
     return levels
 
 
-def shade(surface: ShadedSurface, hits: Hits) -> NDArray[np.uint8]:
+def shade(surface: Surface, hits: Hits) -> NDArray[np.uint8]:
     """Texture times vertex colour at every hit, multiplied as stored; black where nothing was hit.
 
     A pixel's footprint on the surface comes from ray differentials; it is averaged by up to eight trilinear probes

@@ -5,10 +5,10 @@ import numpy as np
 from avp_habitat.scenes.builtin.kit import Kit, Lamp, Piece, shifted
 from avp_habitat.scenes.builtin.noise import Random
 from avp_habitat.scenes.builtin.pictures import SPINES, spine_cell
-from avp_habitat.scenes.builtin.shapes import HALF_TURN, Surface, box, cylinder, lathe, sheet, yawed
+from avp_habitat.scenes.builtin.shapes import HALF_TURN, MeshSurface, box, cylinder, lathe, sheet, yawed
 
 
-def vase(kit: Kit, rng: Random, high: float) -> list[Surface]:
+def vase(kit: Kit, rng: Random, high: float) -> list[MeshSurface]:
     """A bellied vase, its foot at the origin, metres."""
     belly = high * rng.uniform(0.26, 0.36)
     shares = ((0.45, 1), (0.5, 0.92), (0.36, 0.8), (0.8, 0.6), (1, 0.36), (0.8, 0.12), (0.55, 0))
@@ -16,7 +16,7 @@ def vase(kit: Kit, rng: Random, high: float) -> list[Surface]:
     return lathe(profile, (0, 0, 0), rng.choice(kit.ceramics), segments=12)
 
 
-def bowl(kit: Kit, rng: Random) -> list[Surface]:
+def bowl(kit: Kit, rng: Random) -> list[MeshSurface]:
     """A bowl with fruit, its foot at the origin."""
     profile = [(0.001, 0.03), (0.09, 0.05), (0.14, 0.09), (0.145, 0.09), (0.1, 0.03), (0.06, 0.0)]
     made = lathe(profile, (0, 0, 0), rng.choice(kit.ceramics), segments=14)
@@ -26,7 +26,7 @@ def bowl(kit: Kit, rng: Random) -> list[Surface]:
     return made
 
 
-def book_stack(kit: Kit, rng: Random) -> list[Surface]:
+def book_stack(kit: Kit, rng: Random) -> list[MeshSurface]:
     """A few books lying on each other, foot at the origin."""
     made, y = [], 0.0
     for _ in range(rng.integer(2, 4)):
@@ -37,7 +37,7 @@ def book_stack(kit: Kit, rng: Random) -> list[Surface]:
     return made
 
 
-def table_lamp(kit: Kit, rng: Random) -> list[Surface]:
+def table_lamp(kit: Kit, rng: Random) -> list[MeshSurface]:
     """A small lamp, its foot at the origin, 0.46 m high."""
     foot = [(0.012, 0.3), (0.02, 0.24), (0.06, 0.16), (0.075, 0.09), (0.05, 0.02), (0.06, 0.0)]
     made = lathe(foot, (0, 0, 0), rng.choice(kit.ceramics), segments=10)
@@ -81,7 +81,7 @@ def pendant(kit: Kit, rng: Random, ceiling: float, bottom: float) -> Piece:
     return Piece("pendant", made, 0.52, 0.52, ceiling, (Lamp((0.0, bottom - 0.05, 0.0), 0.45),))
 
 
-def _leaf(kit: Kit, root: np.ndarray, yaw: float, rise: float, length: float, width: float) -> list[Surface]:
+def _leaf(kit: Kit, root: np.ndarray, yaw: float, rise: float, length: float, width: float) -> list[MeshSurface]:
     """One bent leaf from its root outwards."""
     along = np.linspace(0.0, 1.0, 5)
     ahead = np.array([np.sin(yaw), 0.0, np.cos(yaw)])
@@ -114,11 +114,11 @@ def plant(kit: Kit, rng: Random) -> Piece:
     return Piece("plant", made, 0.72, 0.72, high + 0.05)
 
 
-def picture(kit: Kit, rng: Random, width: float, height: float) -> list[Surface]:
+def picture(kit: Kit, rng: Random, width: float, height: float) -> list[MeshSurface]:
     """A framed painting whose back touches z = 0, centred at the origin."""
     frame = rng.choice((kit.dark_wood, kit.wood, kit.black, kit.trim, kit.metal))
     bar, deep = 0.035, 0.03
-    made: list[Surface] = []
+    made: list[MeshSurface] = []
     for side in (-1, 1):
         made += box((width, bar, deep), (0, side * (height - bar) / 2, deep / 2 + 0.002), frame, pitch=1)
         made += box((bar, height - 2 * bar, deep), (side * (width - bar) / 2, 0, deep / 2 + 0.002), frame, pitch=1)
@@ -128,11 +128,11 @@ def picture(kit: Kit, rng: Random, width: float, height: float) -> list[Surface]
     return made
 
 
-def clock(kit: Kit) -> list[Surface]:
+def clock(kit: Kit) -> list[MeshSurface]:
     """A round wall clock of 0.3 m whose back touches z = 0, centred at the origin."""
     angle = np.linspace(0, 2 * np.pi, 25)
     sine, cosine = np.sin(angle), np.cos(angle)
-    made: list[Surface] = []
+    made: list[MeshSurface] = []
     for radius, z, material in ((0.16, 0.03, kit.dark_wood), (0.14, 0.033, kit.linen)):
         rings = ((radius, 0.002), (radius, z), (0.001, z))
         points = np.stack([np.stack([r * sine, r * cosine, np.full(25, depth)], axis=-1) for r, depth in rings])
@@ -146,7 +146,7 @@ def clock(kit: Kit) -> list[Surface]:
     return made
 
 
-def _row_of_books(kit: Kit, rng: Random, width: float, clear: float, depth: float) -> list[Surface]:
+def _row_of_books(kit: Kit, rng: Random, width: float, clear: float, depth: float) -> list[MeshSurface]:
     """Books from the left until the board is nearly full; foot of the row at the origin, spines to +z."""
     made, x = [], -width / 2 + 0.01
     end = width / 2 - rng.uniform(0.05, 0.4) * min(width, 0.8)
@@ -163,7 +163,7 @@ def _row_of_books(kit: Kit, rng: Random, width: float, clear: float, depth: floa
     return made
 
 
-def _filled_board(kit: Kit, rng: Random, width: float, clear: float, depth: float) -> list[Surface]:
+def _filled_board(kit: Kit, rng: Random, width: float, clear: float, depth: float) -> list[MeshSurface]:
     """What stands on one board of a shelf."""
     if rng.chance(0.78):
         return _row_of_books(kit, rng, width, clear, depth)
@@ -173,9 +173,9 @@ def _filled_board(kit: Kit, rng: Random, width: float, clear: float, depth: floa
     return made + shifted(vase(kit, rng, clear * 0.75), width * 0.25, 0, depth / 2 - 0.12)
 
 
-def _shelf_half(kit: Kit, rng: Random, width: float, depth: float, high: float, columns: int) -> list[Surface]:
+def _shelf_half(kit: Kit, rng: Random, width: float, depth: float, high: float, columns: int) -> list[MeshSurface]:
     """Boards and their contents of a shelf whose back is at z = 0 and whose front is at z = depth."""
-    made: list[Surface] = []
+    made: list[MeshSurface] = []
     boards = max(3, round(high / 0.38))
     pitch = (high - 0.1) / boards
     column = (width - 0.03) / columns

@@ -11,7 +11,7 @@ from avp_habitat.scenes.builtin import decor, groups, seating
 from avp_habitat.scenes.builtin.groups import Arrange, Group, Member
 from avp_habitat.scenes.builtin.kit import FLAT_M, Kit, Lamp, Piece, shifted
 from avp_habitat.scenes.builtin.noise import Random
-from avp_habitat.scenes.builtin.shapes import Float, Rectangle, Surface, moved
+from avp_habitat.scenes.builtin.shapes import Float, MeshSurface, Rectangle, moved
 from avp_habitat.scenes.builtin.shell import CURTAIN_M, Point, Shell, Wall, curtain_bottom
 
 CELL_M = 0.1
@@ -78,7 +78,7 @@ class Placed:
     footprint: Rectangle
     """x0, z0, x1, z1 of the axis-aligned rectangle that it keeps to."""
 
-    def surfaces(self) -> list[Surface]:
+    def surfaces(self) -> list[MeshSurface]:
         """Its triangles in the world frame."""
         return moved(self.piece.surfaces, self.axes, self._foot)
 

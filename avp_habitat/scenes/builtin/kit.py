@@ -8,7 +8,7 @@ import numpy as np
 
 from avp_habitat.scenes.builtin import finishes, pictures
 from avp_habitat.scenes.builtin.noise import Colour, Picture, Random, blend, shade
-from avp_habitat.scenes.builtin.shapes import Material, Surface, Vector, moved
+from avp_habitat.scenes.builtin.shapes import Material, MeshSurface, Vector, moved
 
 FLAT_M = 0.02
 """Pieces no higher than this lie on the floor without being in the way."""
@@ -30,7 +30,7 @@ class Piece:
     """Furniture in its own frame: foot at the origin, y up, front towards +z; extents in metres, centred in x and z."""
 
     kind: str
-    surfaces: list[Surface]
+    surfaces: list[MeshSurface]
     width: float
     """Along x."""
     depth: float
@@ -39,7 +39,7 @@ class Piece:
     lamps: tuple[Lamp, ...] = ()
 
 
-def shifted(surfaces: list[Surface], x: float, y: float, z: float) -> list[Surface]:
+def shifted(surfaces: list[MeshSurface], x: float, y: float, z: float) -> list[MeshSurface]:
     """The same surfaces elsewhere, metres."""
     return moved(surfaces, np.eye(3), np.array([x, y, z]))
 

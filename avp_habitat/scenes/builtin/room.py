@@ -11,7 +11,7 @@ from avp_habitat.errors import UsageError
 from avp_habitat.scenes.builtin.furnish import Placed, furnish
 from avp_habitat.scenes.builtin.kit import Kit, Lamp
 from avp_habitat.scenes.builtin.noise import Random
-from avp_habitat.scenes.builtin.shapes import Float, Surface, joined
+from avp_habitat.scenes.builtin.shapes import Float, MeshSurface, joined
 from avp_habitat.scenes.builtin.shell import Shell, build_shell, plan_shell
 from avp_habitat.scenes.mesh import TexturedMesh, merge
 
@@ -41,7 +41,7 @@ def _snapped(values: np.ndarray) -> np.ndarray:
     return np.rint(values * 8192) / 8192
 
 
-def _mesh(surface: Surface, colours: np.ndarray) -> TexturedMesh:
+def _mesh(surface: MeshSurface, colours: np.ndarray) -> TexturedMesh:
     """A surface as the renderers take it."""
     return TexturedMesh(
         surface.vertices.astype(np.float32),
@@ -75,7 +75,7 @@ def generate_room(seed: int) -> TexturedMesh:
 class _Voxels:
     """What of the room's space is filled, and how filled the surroundings of each place are."""
 
-    def __init__(self, shell: Shell, surfaces: list[Surface]) -> None:
+    def __init__(self, shell: Shell, surfaces: list[MeshSurface]) -> None:
         """Fill every voxel that a surface passes through and everything outside the room."""
         x0, z0, x1, z1 = shell.bounds
         self._origin = np.array([x0, 0.0, z0]) - _PADDING * _VOXEL_M - _OFF_THE_GRID
@@ -123,7 +123,7 @@ class _Voxels:
         return through
 
 
-def _samples(surface: Surface) -> Float:
+def _samples(surface: MeshSurface) -> Float:
     """Points on the triangles, close enough together to fill every voxel that they pass through."""
     corners = surface.vertices[surface.triangles]
     weights = np.array([[i, j, 4 - i - j] for i in range(5) for j in range(5 - i)]) / 4
@@ -157,7 +157,7 @@ def _windows(shell: Shell) -> Iterator[tuple[Float, float]]:
                 yield np.array([x, (hole.bottom + hole.top) / 2 + 0.2, z]), 0.3 * width
 
 
-def _bake(shell: Shell, surfaces: list[Surface], lamps: list[Lamp]) -> list[NDArray[np.float32]]:
+def _bake(shell: Shell, surfaces: list[MeshSurface], lamps: list[Lamp]) -> list[NDArray[np.float32]]:
     """`(v, 3)` light in [0, 1] on each surface, from windows and lamps; all is in the world frame."""
     voxels = _Voxels(shell, surfaces)
     points, normals = (np.concatenate([getattr(each, name) for each in surfaces]) for name in ("vertices", "normals"))

@@ -3,13 +3,13 @@
 from avp_habitat.scenes.builtin.decor import book_stack, bowl, table_lamp, vase
 from avp_habitat.scenes.builtin.kit import Kit, Lamp, Piece, shifted
 from avp_habitat.scenes.builtin.noise import Random
-from avp_habitat.scenes.builtin.shapes import Material, Surface, box, cushion, cylinder, lathe, leaned, yawed
+from avp_habitat.scenes.builtin.shapes import Material, MeshSurface, box, cushion, cylinder, lathe, leaned, yawed
 
 SEAT_M = 0.46
 """Seats are higher than an agent with quantised steps of 0.2 m can climb."""
 
 
-def _legs(width: float, depth: float, height: float, side: float, material: Material) -> list[Surface]:
+def _legs(width: float, depth: float, height: float, side: float, material: Material) -> list[MeshSurface]:
     x, z = width / 2 - side / 2, depth / 2 - side / 2
     made = []
     for sx, sz in ((-x, -z), (x, -z), (-x, z), (x, z)):
@@ -17,7 +17,7 @@ def _legs(width: float, depth: float, height: float, side: float, material: Mate
     return made
 
 
-def _pillow(kit: Kit, rng: Random, x: float, y: float, z: float, lean: float = -0.3) -> list[Surface]:
+def _pillow(kit: Kit, rng: Random, x: float, y: float, z: float, lean: float = -0.3) -> list[MeshSurface]:
     """A loose pillow that leans back; (x, y, z) is where its lower edge rests."""
     side = rng.uniform(0.36, 0.46)
     made = shifted(cushion((side, side, 0.1), (0, 0, 0), 0.05, rng.choice(kit.cushions), puff=0.03), 0, side / 2, 0)
@@ -75,7 +75,7 @@ def chair(kit: Kit, rng: Random, material: Material) -> Piece:
 
 def office_chair(kit: Kit, rng: Random) -> Piece:
     """A swivel chair on a star foot."""
-    made: list[Surface] = []
+    made: list[MeshSurface] = []
     for turn in range(5):
         made += yawed(box((0.05, 0.05, 0.27), (0, 0.06, 0.135), kit.black, pitch=1), turn * 1.2566)
     made += cylinder(0.035, 0.06, 0.42, (0, 0, 0), kit.metal, 8)

@@ -34,7 +34,7 @@ class Material:
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class MeshSurface:
     """Triangles of one material, counter-clockwise as seen from outside."""
 
     vertices: Float
@@ -60,7 +60,7 @@ def _unit(vectors: Float) -> Float:
     return vectors / np.where(length < 1e-12, 1.0, length)
 
 
-def sheet(points: Float, uv: Float, material: Material, *, both_sides: bool = False) -> list[Surface]:
+def sheet(points: Float, uv: Float, material: Material, *, both_sides: bool = False) -> list[MeshSurface]:
     """A curved sheet through `(rows, columns, 3)` points in metres; `both_sides` adds a back, 3 mm behind the front.
 
     Rows run down and columns right, seen from the front; texture coordinates are `(rows, columns, 2)`.
@@ -73,7 +73,7 @@ def sheet(points: Float, uv: Float, material: Material, *, both_sides: bool = Fa
     for corner in range(3):
         np.add.at(normals, triangles[:, corner], face)
     normals = _unit(normals)
-    front = Surface(vertices, normals, uv.reshape(-1, 2), triangles, material)
+    front = MeshSurface(vertices, normals, uv.reshape(-1, 2), triangles, material)
     if not both_sides:
         return [front]
     back = replace(front, vertices=vertices - 0.003 * normals, normals=-normals, triangles=triangles[:, ::-1].copy())
@@ -101,7 +101,7 @@ def panel(
     turned: bool = False,
     origin: tuple[float, float] = (0.0, 0.0),
     holes: tuple[Rectangle, ...] = (),
-) -> Surface:
+) -> MeshSurface:
     """A flat rectangle, subdivided so that light can vary over it; all lengths are in metres.
 
     Args:
@@ -139,7 +139,7 @@ def panel(
     normal = _unit(np.cross(fall, across))
     used, triangles = np.unique(triangles, return_inverse=True)
     vertices, uv, triangles = points.reshape(-1, 3)[used], uv[used], triangles.reshape(-1, 3).astype(np.int32)
-    return Surface(vertices, np.broadcast_to(normal, vertices.shape).copy(), uv, triangles, material)
+    return MeshSurface(vertices, np.broadcast_to(normal, vertices.shape).copy(), uv, triangles, material)
 
 
 _FACES = {
@@ -171,7 +171,7 @@ _UNIT_QUAD = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]])
 
 def _small_box(
     size: Float, middle: Float, material: Material, faces: tuple[str, ...], fit: Rectangle | None
-) -> Surface:
+) -> MeshSurface:
     """A cuboid of one quad per face."""
     vertices = middle + size / 2 * np.concatenate([_CORNERS[face] for face in faces])
     normals, uv = np.zeros_like(vertices), np.empty((len(vertices), 2))
@@ -186,7 +186,7 @@ def _small_box(
         metres = _UNIT_QUAD * [size[right], size[down]] + origin
         uv[rows] = (metres[:, ::-1] if down == longest else metres) / [material.width_m, material.height_m]
     triangles = (_QUAD[None] + 4 * np.arange(len(faces), dtype=np.int32)[:, None, None]).reshape(-1, 3)
-    return Surface(vertices, normals, uv, triangles, material)
+    return MeshSurface(vertices, normals, uv, triangles, material)
 
 
 def _picture_origin(middle: Float) -> tuple[float, float]:
@@ -203,7 +203,7 @@ def box(
     faces: tuple[str, ...] = ALL_FACES,
     fit: Rectangle | None = None,
     pitch: float = 0.35,
-) -> list[Surface]:
+) -> list[MeshSurface]:
     """A cuboid of extents and middle in metres; the picture's u runs along its longest edge, as wood is cut.
 
     Faces are front (+z), back, right (+x), left, top, bottom; `fit` and `pitch` as of `panel`.
@@ -223,7 +223,7 @@ def box(
     return made
 
 
-def cushion(size: Vector, centre: Vector, radius: float, material: Material, *, puff: float = 0.0) -> list[Surface]:
+def cushion(size: Vector, centre: Vector, radius: float, material: Material, *, puff: float = 0.0) -> list[MeshSurface]:
     """A cuboid with rounded edges; `puff` metres of bulge along its thinnest extent make a pillow."""
     half, middle = np.asarray(size) / 2, np.asarray(centre, dtype=np.float64)
     radius = min(radius, float(half.min()) * 0.98)
@@ -257,7 +257,7 @@ def lathe(
     *,
     segments: int = 12,
     open_ended: bool = False,
-) -> list[Surface]:
+) -> list[MeshSurface]:
     """A surface of revolution about the vertical axis whose foot is `centre`.
 
     The profile is (radius, height) in metres from the top of the outside downwards, `segments` the number of faces
@@ -277,32 +277,32 @@ def lathe(
 
 def cylinder(
     radius: float, bottom: float, top: float, centre: Vector, material: Material, segments: int = 12
-) -> list[Surface]:
+) -> list[MeshSurface]:
     """An upright cylinder with sharp rims between two heights above its foot, metres."""
     rims = [(0.0005, top), (radius, top), (radius, bottom), (0.0005, bottom)]
     return [part for ends in pairwise(rims) for part in lathe([*ends], centre, material, segments=segments)]
 
 
-def moved(surfaces: list[Surface], axes: Float, offset: Float) -> list[Surface]:
+def moved(surfaces: list[MeshSurface], axes: Float, offset: Float) -> list[MeshSurface]:
     """The same surfaces turned by `axes` (3, 3), whose columns are the new x, y and z, then shifted by `offset`."""
     return [replace(s, vertices=s.vertices @ axes.T + offset, normals=s.normals @ axes.T) for s in surfaces]
 
 
-def yawed(surfaces: list[Surface], yaw: float, offset: Vector = (0.0, 0.0, 0.0)) -> list[Surface]:
+def yawed(surfaces: list[MeshSurface], yaw: float, offset: Vector = (0.0, 0.0, 0.0)) -> list[MeshSurface]:
     """The same surfaces turned about +Y by `yaw` radians, then shifted."""
     cosine, sine = np.cos(yaw), np.sin(yaw)
     return moved(surfaces, np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]), np.asarray(offset))
 
 
-def leaned(surfaces: list[Surface], angle: float) -> list[Surface]:
+def leaned(surfaces: list[MeshSurface], angle: float) -> list[MeshSurface]:
     """The same surfaces turned about +X by `angle` radians; negative angles lean them back."""
     cosine, sine = np.cos(angle), np.sin(angle)
     return moved(surfaces, np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]]), np.zeros(3))
 
 
-def joined(surfaces: list[Surface]) -> list[Surface]:
+def joined(surfaces: list[MeshSurface]) -> list[MeshSurface]:
     """The same triangles with one surface per material, in order of first appearance."""
-    by_material: dict[int, list[Surface]] = {}
+    by_material: dict[int, list[MeshSurface]] = {}
     for surface in surfaces:
         by_material.setdefault(id(surface.material), []).append(surface)
     made = []
@@ -312,5 +312,5 @@ def joined(surfaces: list[Surface]) -> list[Surface]:
         vertices, normals, uv = (
             np.concatenate([getattr(part, name) for part in parts]) for name in ("vertices", "normals", "uv")
         )
-        made.append(Surface(vertices, normals, uv, np.concatenate(triangles), parts[0].material))
+        made.append(MeshSurface(vertices, normals, uv, np.concatenate(triangles), parts[0].material))
     return made

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.scenes.builtin.kit import Kit
 from avp_habitat.scenes.builtin.noise import Random
-from avp_habitat.scenes.builtin.shapes import Material, Rectangle, Surface, box, moved, panel, sheet
+from avp_habitat.scenes.builtin.shapes import Material, MeshSurface, Rectangle, box, moved, panel, sheet
 
 Point = tuple[float, float]
 """x, z on the floor in metres, or a direction there."""
@@ -155,7 +155,7 @@ def plan_shell(rng: Random) -> Shell:
     return replace(shell, openings=tuple(openings))
 
 
-def _floor_and_ceiling(kit: Kit, shell: Shell) -> list[Surface]:
+def _floor_and_ceiling(kit: Kit, shell: Shell) -> list[MeshSurface]:
     x0, z0, x1, z1 = shell.bounds
     floor_hole, ceiling_hole = (), ()
     if shell.notch is not None:
@@ -169,7 +169,7 @@ def _floor_and_ceiling(kit: Kit, shell: Shell) -> list[Surface]:
     ]
 
 
-def _reveal(left: float, right: float, bottom: float, top: float, deep: float, material: Material) -> list[Surface]:
+def _reveal(left: float, right: float, bottom: float, top: float, deep: float, material: Material) -> list[MeshSurface]:
     """The four inner sides of a hole in a wall, in the wall's frame."""
     fall, across = (0.0, bottom - top, 0.0), (right - left, 0.0, 0.0)
     return [
@@ -180,7 +180,7 @@ def _reveal(left: float, right: float, bottom: float, top: float, deep: float, m
     ]
 
 
-def _window_surfaces(kit: Kit, hole: Opening) -> list[Surface]:
+def _window_surfaces(kit: Kit, hole: Opening) -> list[MeshSurface]:
     left, right, bottom, top = hole.left, hole.right, hole.bottom, hole.top
     width, height = right - left, top - bottom
     made = _reveal(left, right, bottom, top, _RECESS_M, kit.trim)
@@ -195,7 +195,7 @@ def _window_surfaces(kit: Kit, hole: Opening) -> list[Surface]:
     return made + box(sill, ((left + right) / 2, bottom - 0.004, 0.025 - _RECESS_M / 2 + 0.02), kit.trim)
 
 
-def _door(kit: Kit, hole: Opening) -> list[Surface]:
+def _door(kit: Kit, hole: Opening) -> list[MeshSurface]:
     left, right, top, deep = hole.left, hole.right, hole.top, 0.06
     width, middle = right - left, (left + right) / 2
     made = _reveal(left, right, 0.0, top, deep, kit.trim)
@@ -211,7 +211,7 @@ def _door(kit: Kit, hole: Opening) -> list[Surface]:
     return made + box((width, 0.08, 0.021), (middle, top + 0.04, 0.0105), kit.trim, pitch=0.6)
 
 
-def _drape(kit: Kit, left: float, right: float, bottom: float, top: float) -> list[Surface]:
+def _drape(kit: Kit, left: float, right: float, bottom: float, top: float) -> list[MeshSurface]:
     """A curtain in folds, in the wall's frame."""
     folds = np.linspace(0.0, 1.0, 25)
     rows = np.linspace(0.0, 1.0, 8)
@@ -225,7 +225,7 @@ def _drape(kit: Kit, left: float, right: float, bottom: float, top: float) -> li
     return sheet(points, uv, cloth, both_sides=True)
 
 
-def _curtains(kit: Kit, hole: Opening, bottom: float) -> list[Surface]:
+def _curtains(kit: Kit, hole: Opening, bottom: float) -> list[MeshSurface]:
     top = hole.top + 0.14
     made = _drape(kit, hole.left - CURTAIN_M + 0.02, hole.left + 0.04, bottom, top)
     made += _drape(kit, hole.right - 0.04, hole.right + CURTAIN_M - 0.02, bottom, top)
@@ -238,7 +238,7 @@ def curtain_bottom(shell: Shell, hole: Opening) -> float:
     return 0.03 if round(shell.ceiling * 100) % 2 else hole.bottom - 0.15
 
 
-def _skirting(kit: Kit, wall: Wall, holes: list[Opening]) -> list[Surface]:
+def _skirting(kit: Kit, wall: Wall, holes: list[Opening]) -> list[MeshSurface]:
     beside = [edge for hole in holes if hole.kind == "door" for edge in (hole.left - 0.08, hole.right + 0.08)]
     edges = [0.0, *beside, wall.length]
     made = []
@@ -249,7 +249,7 @@ def _skirting(kit: Kit, wall: Wall, holes: list[Opening]) -> list[Surface]:
     return made
 
 
-def _wall(kit: Kit, shell: Shell, index: int, material: Material) -> list[Surface]:
+def _wall(kit: Kit, shell: Shell, index: int, material: Material) -> list[MeshSurface]:
     wall, high = shell.walls[index], shell.ceiling
     holes = [hole for hole in shell.openings if hole.wall == index]
     cut = tuple((hole.left, high - hole.top, hole.right, high - hole.bottom) for hole in holes)
@@ -263,7 +263,7 @@ def _wall(kit: Kit, shell: Shell, index: int, material: Material) -> list[Surfac
     return moved(made, wall.axes(), np.array([wall.start[0], 0.0, wall.start[1]]))
 
 
-def build_shell(kit: Kit, rng: Random, shell: Shell) -> list[Surface]:
+def build_shell(kit: Kit, rng: Random, shell: Shell) -> list[MeshSurface]:
     """All surfaces of the empty room in the world frame; their fronts look inwards."""
     made = _floor_and_ceiling(kit, shell)
     order = rng.shuffled(list(range(len(shell.walls))))
