@@ -145,9 +145,7 @@ def find_metrics(chosen: Sequence[str | MetricFunction]) -> list[Any]:
         said = plugins.name_of(name)
         figure = getattr(function, "figure", None)
         if not (callable(function) and isinstance(figure, Figure)):
-            raise UsageError(
-                f"metric {said!r}: expected a function that `metric(Figure(...))` decorates, got {function!r}"
-            )
+            raise UsageError(f"metric {said!r}: expected a function decorated by `metric(Figure(…))`, got {function!r}")
         if figure.name in taken:
             raise UsageError(f"metric {said!r}: there is a figure named {figure.name!r} already; choose another name")
         taken.add(figure.name)
