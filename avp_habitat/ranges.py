@@ -59,7 +59,8 @@ def number(name: str, value: Any, kind: type, limits: Range) -> Any:
     real = isinstance(value, Real) and not isinstance(value, bool)
     given: Any = value
     if not real or not limits.least <= given <= limits.most or (whole and given % 1):
-        expected = f"a {'whole ' if whole else ''}number from {limits.least:,g} to {limits.most:,g}"
+        least, most = (f"{limit:,.0f}" if whole else f"{limit:,g}" for limit in (limits.least, limits.most))
+        expected = f"a {'whole ' if whole else ''}number from {least} to {most}"
         raise UsageError(f"{name}: expected {expected}, got {value!r}")
     return kind(given)
 

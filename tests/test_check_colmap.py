@@ -98,7 +98,7 @@ def test_a_model_without_points_holds_the_poses(walk, tmp_path):
 
 def test_an_existing_folder_is_refused(walk, tmp_path):
     (tmp_path / "model").mkdir()
-    with pytest.raises(UsageError, match=r"model: exists already, expected a new folder"):
+    with pytest.raises(UsageError, match=r"model: exists already; choose another name"):
         export_colmap(walk, tmp_path / "model", progress=False)
     assert list((tmp_path / "model").iterdir()) == []
 
@@ -108,7 +108,7 @@ def test_a_failure_leaves_nothing_behind(walk, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(colmap, "_write_model", full)
-    with pytest.raises(RolloutError, match=r"model: could not write the COLMAP model: No space left on device"):
+    with pytest.raises(RolloutError, match=r"model: cannot write there: No space left on device"):
         export_colmap(walk, tmp_path / "model", points=False, progress=False)
     assert list(tmp_path.iterdir()) == []
 

@@ -160,8 +160,8 @@ def test_a_model_of_another_environment_is_refused(tmp_path, capfd):
         ({"--scene": "nowhere.glb"}, 1, "nowhere.glb: no such scene file"),
         ({"--scene": "room.xyz"}, 2, "room.xyz: expected a scene file"),
         ({"--budget": "0"}, 2, "budget: expected a whole number from 1 to 32,767, got 0"),
-        ({"--width": "4"}, 2, "--width: expected 8 to 8192 pixels, got 4"),
-        ({"--seed": "-1"}, 2, "--seed: expected a whole number from 0, got -1"),
+        ({"--width": "4"}, 2, "--width: expected a whole number from 8 to 8,192, got 4"),
+        ({"--seed": "-1"}, 2, "--seed: expected a whole number from 0 to 4,294,967,295, got -1"),
     ],
 )
 def test_wrong_input_is_one_line_with_its_exit_code(tmp_path, capfd, change, code, words):
@@ -183,7 +183,7 @@ def test_an_existing_folder_is_not_touched(rollout, capfd):
 def test_a_damaged_model_file_is_named(tmp_path, capfd):
     (tmp_path / "model.zip").write_bytes(b"PK but no zip")
     assert collect("--scene", "builtin:0", "--policy", tmp_path / "model.zip", "--out", tmp_path / "r") == 1
-    assert "model.zip: expected a model saved by Stable-Baselines3" in capfd.readouterr().err
+    assert "model.zip: expected a model of Stable-Baselines3" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("name", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])

@@ -20,7 +20,8 @@ import nerfstudio.scripts.train  # noqa: F401
 import tyro
 from nerfstudio.configs.dataparser_configs import dataparsers
 
-from avp_nerfstudio.check.__main__ import main as check
+from avp_habitat import command
+from avp_nerfstudio.check.__main__ import Check
 from avp_nerfstudio.data.dataparser import AVPDataParserConfig
 
 
@@ -121,7 +122,7 @@ def test_a_folder_of_another_tool_is_recognised_and_its_reader_named(tmp_path, k
     text = refusal(folder)
     assert re.search(f"expected a rollout \\(rollout.json\\), found what looks like {what}.*{reader}", text)
     with pytest.raises(RolloutError, match=what):
-        check([str(folder), "--no-pictures"])
+        command.parse(Check, [str(folder), "--no-pictures"])
     assert [path.name for path in tmp_path.iterdir()] == ["their data"]
 
 

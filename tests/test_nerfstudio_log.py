@@ -238,7 +238,7 @@ def test_a_rollout_that_has_gone_is_named(copy, capsys):
 @pytest.mark.parametrize(
     ("options", "code", "text"),
     [
-        (["--pictures", "-1"], 2, "--pictures: expected a whole number from 0 to 1e+09, got -1"),
+        (["--pictures", "-1"], 2, "--pictures: expected a whole number from 0 to 1,000,000,000, got -1"),
         (["--rerun", __file__], 2, "exists already"),
         (["--output", __file__], 2, "cannot make this folder"),
         (["--mlflow", "nonsense://host"], 1, "MLflow at nonsense://host cannot be used"),

@@ -142,7 +142,7 @@ def test_nerfacto_trains_on_merged_rollouts_ordered_and_without_depth(shell, tmp
         (lambda f: (f / "images/frame_00001.png").unlink(), [], "{f}/images/frame_00001.png: expected this file"),
         (lambda f: (f / "poses/frame_00001.txt").write_text("nan " * 16), [], "{f}/poses/frame_00001.txt: not a rigid"),
         (lambda f: None, ["--also", "{f}"], "{f}: expected each rollout once, it is named twice"),
-        (lambda f: None, ["--every", "0"], "avp-data: every: expected a whole number from 1 to 1e+06, got 0"),
+        (lambda f: None, ["--every", "0"], "avp-data: every: expected a whole number from 1 to 1,000,000, got 0"),
     ],
     ids=["missing picture", "NaN pose", "named twice", "impossible option"],
 )

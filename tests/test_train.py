@@ -57,14 +57,14 @@ def test_the_training_script_trains_tracks_and_saves(tmp_path):
     [
         (("--agents", 3), "--agents: expected a divisor of PPO's buffer of 2048 steps, got 3"),
         (("--reward", "cover"), "unknown reward 'cover'"),
-        (("--steps", 0), "--steps: expected a whole number from 1 to 1e+12, got 0"),
+        (("--steps", 0), "--steps: expected a whole number from 1 to 1,000,000,000,000, got 0"),
         (
             ("--observation", "maps"),
             "unknown observation 'maps': expected one of map, numbers, surface_map; did you mean 'map'?",
         ),
         (("--resume", "no.zip"), "--resume no.zip: no such model file"),
         (("--resume", "runs:/1/model.zip"), "--resume runs:/1/model.zip: no MLflow database at sqlite:///"),
-        (("--eval-every", 0), "--eval-every: expected a whole number from 1 to 1e+12, got 0"),
+        (("--eval-every", 0), "--eval-every: expected a whole number from 1 to 1,000,000,000,000, got 0"),
         (("--gpu", 0), "--gpu: is of the simulator 'habitat', but 'raycast' was chosen"),
         (("--workers", 0), "workers: expected 1 or a multiple of it, as there is 1 scene, got 0"),
     ],

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.poses import Intrinsics, pixel_directions
-from avp_habitat.sight.rules import pairs_in_image
 from avp_habitat.simulators.base import Frames
 
 if TYPE_CHECKING:
@@ -133,6 +132,8 @@ class RaycastSimulator:
         tolerance_m: float,
     ) -> NDArray[np.bool_]:
         """Whether cameras see points; see `simulators.base.Simulator.visible`."""
+        from avp_habitat.sight.rules import pairs_in_image
+
         seen = pairs_in_image(camera_to_world, intrinsics, points, pairs)
         eye = np.asarray(camera_to_world)[:, :3, 3]
         seen[seen] = self.reached(eye, points, pairs[seen], tolerance_m=tolerance_m)
