@@ -65,11 +65,15 @@ class Runner:
         waiting = [cell for cell in cells if not self.folder.is_done(cell)]
         running: dict[Any, Cell] = {}
         done = len(cells) - len(waiting)
+        shown = time.monotonic()
         with command.progress(total=len(cells), initial=done, desc="experiment", unit="cell") as bar:
             try:
                 while waiting or running:
                     self._start(context, waiting, running)
-                    bar.set_postfix_str(", ".join(cell.key for cell in running.values()))
+                    # In a file each showing is a line.
+                    due = sys.stderr.isatty() or time.monotonic() >= shown + command.SECONDS
+                    shown = time.monotonic() if due else shown
+                    bar.set_postfix_str(", ".join(cell.key for cell in running.values()), refresh=due)
                     wait([process.sentinel for process in running], timeout=1)
                     bar.update(self._collect(running) + self._pass_over(waiting))
             except BaseException:
