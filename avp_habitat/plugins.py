@@ -47,7 +47,11 @@ def find(group: str, name: Any, known: Mapping[str, Any]) -> Any:
         return _load(kind, name, found) if isinstance(found, str) else found
     if ":" in name:
         return _load(kind, name, name)
-    raise unknown_name(kind, name, names(group, known))
+    if not (there := names(group, known)):
+        raise UsageError(
+            f"unknown {kind} {name!r}: expected MODULE:OBJECT; no installed distribution registers {group}"
+        )
+    raise unknown_name(kind, name, there)
 
 
 def declares(**facts: Any) -> Callable[[Function], Function]:

@@ -1,4 +1,4 @@
-"""The outline of a picture of voxel columns, simplified by Recast's rule, as closed rings.
+"""The outline of a navigable area: traced from voxel columns, simplified by Recast's rule, and as walls.
 
 Rings run with the inside on their left in the plane with x to the right and z up, the outer ring first. Source of the
 simplification: M. Mononen, Recast Navigation (contours).

@@ -1,4 +1,4 @@
-"""What the rewards ask about an agent's earlier views, compiled, for n agents at a time."""
+"""How the actions move n agents, and what the rewards ask about their earlier views."""
 
 from typing import NamedTuple
 

@@ -12,7 +12,6 @@ from avp_habitat.task.rewards import RewardConstants, RewardFunction, find_rewar
 
 ACTION_NAMES = ("move_forward", "turn_left", "turn_right", "look_up", "look_down", "stop")
 MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, LOOK_UP, LOOK_DOWN, STOP = range(len(ACTION_NAMES))
-COVERAGE_MODES = ("visible", "over")
 OBSERVATIONS = {
     "numbers": "avp_habitat.task.observations:Numbers",
     "map": "avp_habitat.task.observations:Map",

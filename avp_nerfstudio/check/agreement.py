@@ -1,4 +1,4 @@
-"""Judging cameras by the depth: which frames agree, and which do not."""
+"""Judging cameras by the depth: points of some frames looked for in others, and which frames agree."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Finding the mistake made with single frames: an exchange, or a pose that is a little off."""
+"""Finding the mistake that, undone, makes the depth agree: made with all frames, with a part, or with single ones."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Whether cameras stand upright, as those of a walking agent do."""
+"""The outcome of a check, and whether cameras stand upright, as those of a walking agent do."""
 
 from dataclasses import dataclass, field
 
