@@ -1,12 +1,16 @@
-"""From what the user calls a scene to the mesh file that is shown, and the axes of that file."""
+"""From what the user calls a scene to the mesh file that is shown, and the axes of that file.
 
-import difflib
+Of Habitat-Sim's scene dataset configs that is: the scenes and stages that one names, and what a scene consists of.
+"""
+
+import glob
 import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from avp_habitat.errors import AVPError, SceneError, UsageError
-from avp_habitat.scenes.dataset import SceneDataset
+from avp_habitat.errors import SceneError, UsageError, did_you_mean
 from avp_habitat.scenes.files import SUFFIXES, broken_link
 from avp_habitat.scenes.stage_config import (
     REPLICA_MESH,
@@ -15,16 +19,29 @@ from avp_habitat.scenes.stage_config import (
     Z_UP,
     Layer,
     SceneLocation,
+    expect_neutral,
+    inside,
     is_replica_scene,
+    member,
     read_config,
     read_stage,
     replica_scene,
+    shown,
 )
 
 BUILTIN = "builtin:"
 UPS = ("y", "z")
 """Axes of a mesh file that can point up."""
 DATASET_CONFIG = ".scene_dataset_config.json"
+SCENE_INSTANCE = ".scene_instance.json"
+_SHOWN_NAMES = 5
+_UNMOVED = {
+    "translation": ([0, 0, 0],),
+    "rotation": ([1, 0, 0, 0], [-1, 0, 0, 0]),
+    "uniform_scale": (1,),
+    "non_uniform_scale": ([1, 1, 1],),
+}
+"""Values of a stage's place in a scene instance that leave it where it is."""
 HELP = (
     f"a mesh ({' '.join(SUFFIXES)}), a scene folder of Replica, NAME{STAGE_CONFIG}, NAME{DATASET_CONFIG}:ID, or "
     f"{BUILTIN}SEED for a generated room"
@@ -60,21 +77,20 @@ def locate(spec: str | Path, *, up: str | None = None) -> SceneLocation:
     """
     spec = os.fspath(spec)
     if spec.startswith(BUILTIN):
-        return SceneLocation(f"{BUILTIN}{_seed(spec)}", None)
+        seed = spec.removeprefix(BUILTIN)
+        if not (seed.isascii() and seed.isdigit()):
+            raise UsageError(f"{spec}: expected {BUILTIN}SEED with an integer SEED >= 0, got {seed!r}")
+        return SceneLocation(f"{BUILTIN}{int(seed)}", None)
     dataset, mark, scene_id = spec.partition(f"{DATASET_CONFIG}:")
     path = Path(f"{dataset}{DATASET_CONFIG}" if mark else spec)
     if up is not None and path.name.endswith((DATASET_CONFIG, STAGE_CONFIG)):
         raise UsageError(f"up: {path} says itself which axis of its mesh points up; expected none beside it, got {up}")
     if path.name.endswith(DATASET_CONFIG):
         _expect_file(path, (DATASET_CONFIG,))
-        return SceneDataset(path).scene(scene_id)
+        return _Dataset(path).scene(scene_id)
     if path.name.endswith(STAGE_CONFIG):
         return _stage(path)
-    if path.is_dir():
-        path = _mesh_of(path)
-    elif path.suffix.lower() not in SUFFIXES:
-        raise _unknown(path)
-    _expect_file(path, SUFFIXES)
+    path = _mesh_of(path)
     scene = replica_scene(path)
     found = SceneLocation(path.name, path) if scene is None else SceneLocation(scene.name, path, *Z_UP)
     if up is None:
@@ -83,25 +99,26 @@ def locate(spec: str | Path, *, up: str | None = None) -> SceneLocation:
     return replace(found, up=axes[0], front=axes[1], chosen_up=up)
 
 
-def _seed(spec: str) -> int:
-    text = spec.removeprefix(BUILTIN)
-    if not (text.isascii() and text.isdigit()):
-        raise UsageError(f"{spec}: expected {BUILTIN}SEED with an integer SEED >= 0, got {text!r}")
-    return int(text)
+def _mesh_of(path: Path) -> Path:
+    """The file of a mesh, or the one that is shown of a scene folder of Replica."""
+    if path.is_dir():
+        if not is_replica_scene(Path(os.path.abspath(path))):
+            scenes = _replica_scenes(path)
+            hint = f"; name one of its {len(scenes)} scenes, {path / scenes[0]} say" if scenes else ""
+            raise SceneError(f"{path}: expected a scene file, found a folder that is no scene of Replica{hint}")
+        path = path / REPLICA_MESH
+    elif path.suffix.lower() not in SUFFIXES:
+        if hint := did_you_mean(path.name, _replica_scenes(path.parent)):
+            raise SceneError(f"{path}: no such folder{hint}")
+        raise UsageError(f"{path}: expected a scene file, got the suffix {path.suffix!r}; a scene is {HELP}")
+    _expect_file(path, SUFFIXES)
+    return path
 
 
 def _replica_scenes(folder: Path) -> list[str]:
     """Names of the scenes in a folder that holds Replica, sorted."""
-    return sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and is_replica_scene(entry))
-
-
-def _mesh_of(folder: Path) -> Path:
-    """The mesh that is shown of a scene folder of Replica."""
-    if is_replica_scene(Path(os.path.abspath(folder))):
-        return folder / REPLICA_MESH
-    scenes = _replica_scenes(folder)
-    hint = f"; name one of its {len(scenes)} scenes, {folder / scenes[0]} say" if scenes else ""
-    raise SceneError(f"{folder}: expected a scene file, found a folder that is no scene of Replica{hint}")
+    entries = folder.iterdir() if folder.is_dir() else ()
+    return sorted(entry.name for entry in entries if entry.is_dir() and is_replica_scene(entry))
 
 
 def _stage(path: Path) -> SceneLocation:
@@ -111,18 +128,6 @@ def _stage(path: Path) -> SceneLocation:
     root, axes = Path(os.path.abspath(path)).parents[1], Y_UP if scene is None else Z_UP
     asset, axes = read_stage([Layer(read_config(path), path)], path.parent, root, name=name, axes=axes)
     return SceneLocation(name if scene is None else scene.name, asset, *axes, files=(path,))
-
-
-def _unknown(path: Path) -> AVPError:
-    folders = _replica_scenes(path.parent) if path.parent.is_dir() else []
-    near = difflib.get_close_matches(path.name, folders, n=2, cutoff=0.5)
-    if near:
-        return SceneError(f"{path}: no such folder; did you mean {' or '.join(near)}?")
-    found = f"the suffix {path.suffix!r}" if path.suffix else "no suffix"
-    return UsageError(
-        f"{path}: expected a scene file ({', '.join(SUFFIXES)}), a scene folder of Replica, NAME{STAGE_CONFIG}, "
-        f"NAME{DATASET_CONFIG}:ID or {BUILTIN}SEED, got a name with {found}"
-    )
 
 
 def _expect_file(path: Path, endings: tuple[str, ...]) -> None:
@@ -136,6 +141,166 @@ def _expect_file(path: Path, endings: tuple[str, ...]) -> None:
     if not path.parent.is_dir():
         raise SceneError(f"{path}: there is no folder {path.parent}")
     names = sorted(entry.name for entry in path.parent.iterdir() if entry.name.lower().endswith(endings))
-    near = difflib.get_close_matches(path.name, names, n=1, cutoff=0.5)
-    hint = f"; did you mean {near[0]}?" if near else ""
-    raise SceneError(f"{path}: no such scene file{hint}")
+    raise SceneError(f"{path}: no such scene file{did_you_mean(path.name, names)}")
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A scene instance or a stage of a dataset."""
+
+    handle: str
+    """Path of its file relative to the dataset's folder, or the handle that the dataset config gives it."""
+    file: Path | None
+    """Its config, or the mesh of a stage without one; None for a stage that the dataset config holds itself."""
+    changes: tuple[Layer, ...] = ()
+    """Attributes from the dataset config that override those of `file`."""
+
+    @property
+    def words(self) -> str:
+        """The handle without the ending of configs."""
+        return self.handle.removesuffix(STAGE_CONFIG).removesuffix(SCENE_INSTANCE)
+
+    @property
+    def name(self) -> str:
+        """The handle without folders and the ending of configs; of a stage of Replica the name of its scene."""
+        scene = None if self.file is None else replica_scene(self.file)
+        return self.words.rpartition("/")[2] if scene is None else scene.name
+
+
+class _Dataset:
+    """The scene instances and stages of one scene dataset config; their own files are read when they are asked for."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.folder = path, path.parent
+        config, self._where = read_config(path), f"{path}: "
+        self._scenes = member(config, "scene_instances", {}, self._where)
+        self._stages = member(config, "stages", {}, self._where)
+        self.scenes = list(self._listed(self._scenes, "scene_instances", SCENE_INSTANCE))
+        self.stages = list(self._listed(self._stages, "stages", STAGE_CONFIG))
+        for index, cell in enumerate(member(self._stages, "configs", [], f"{self._where}stages.")):
+            self._add_configured(cell, f"stages.configs[{index}]")
+
+    def scene(self, scene_id: str) -> SceneLocation:
+        """The scene of a handle with or without folders and ending, or of a part of it that no other scene has.
+
+        Scene instances go before stages, as in Habitat-Sim.
+        """
+        every = [*self.scenes, *self.stages]
+        names = sorted({entry.name for entry in every})
+        examples = f"it has {len(names)} scenes" + (f": {_in_short(names)}" if names else "")
+        if not scene_id:
+            raise UsageError(f"{self.path}: expected {self.path.name}:ID with the id of a scene; {examples}")
+        matches = _matches(scene_id, self.scenes, self.stages)
+        if len(matches) > 1:
+            handles = _in_short([entry.handle for entry in matches])
+            raise SceneError(f"{self.path}: {scene_id!r} stands for {len(matches)} scenes: {handles}")
+        if not matches:
+            hint = did_you_mean(scene_id, sorted({*names, *(each.words for each in every)}))
+            raise SceneError(f"{self.path}: has no scene {scene_id!r}; {examples}{hint}")
+        entry = matches[0]
+        found = self._instance(entry) if entry in self.scenes else self._stage(entry)
+        return replace(found, name=entry.name, scene_id=entry.handle)
+
+    def _listed(self, cell: dict[str, Any], key: str, ending: str) -> Iterator[_Entry]:
+        """Entries of the files that the search paths of a cell lead to."""
+        paths = member(cell, "paths", {}, f"{self._where}{key}.")
+        for kind in paths:
+            # Habitat-Sim takes every kind that holds ".json" for one of configs, any other for one of assets.
+            wanted = ending if ".json" in kind else kind
+            for pattern in member(paths, kind, [], f"{self._where}{key}.paths."):
+                for file in self._files(pattern, f"{self._where}{key}.paths.{kind}", wanted):
+                    yield _Entry(file, self.folder / file)
+
+    def _files(self, pattern: Any, where: str, ending: str) -> list[str]:
+        """Paths relative to the dataset's folder of what a pattern matches, and of what lies in matching folders."""
+        if not isinstance(pattern, str) or not pattern or "\0" in pattern:
+            raise SceneError(f"{where}: expected a path, got {shown(pattern)}")
+        found = []
+        for match in sorted(glob.glob(pattern, root_dir=self.folder)):
+            path = inside(self.folder / match, self.folder, where, match)
+            names = [f"{match.rstrip('/')}/{name}" for name in sorted(os.listdir(path))] if path.is_dir() else [match]
+            found += [os.path.normpath(name) for name in names if name.endswith(ending)]
+        return found
+
+    def _add_configured(self, cell: Any, where: str) -> None:
+        """A stage that the dataset config describes itself, or one of its files with changes."""
+        if not isinstance(cell, dict) or not isinstance(cell.get("attributes"), dict):
+            raise SceneError(f"{self.path}: {where}.attributes: expected an object, got {shown(cell)}")
+        change = Layer(cell["attributes"], self.path, f"{where}.attributes.")
+        told = f"{self._where}{where}."
+        origin, handle = (member(cell, key, "", told) for key in ("original_file", "template_handle"))
+        if origin:
+            before = self._stage_of(origin, f"{told}original_file")
+            if not handle:
+                self.stages.remove(before)
+            self.stages.append(_Entry(handle or before.handle, before.file, (*before.changes, change)))
+        elif handle:
+            self.stages.append(_Entry(handle, None, (change,)))
+        else:
+            raise SceneError(f"{self.path}: {where}: expected original_file or template_handle")
+
+    def _stage_of(self, handle: str, where: str) -> _Entry:
+        if matches := _matches(handle, self.stages):
+            return matches[0]
+        hint = did_you_mean(handle, [entry.words for entry in self.stages])
+        raise SceneError(f"{where}: {self.path.name} has no stage {handle!r}{hint}")
+
+    def _stage(self, entry: _Entry) -> SceneLocation:
+        default = member(self._stages, "default_attributes", {}, f"{self._where}stages.")
+        layers = [Layer(default, self.path, "stages.default_attributes.")]
+        folder, files, axes = self.folder, (self.path,), Y_UP
+        if entry.file is not None:
+            config = _config_of(entry.file)
+            folder = config.parent
+            if config.name.endswith(STAGE_CONFIG):
+                layers.append(Layer(read_config(config), config))
+                files = (self.path, config)
+                axes = Y_UP if replica_scene(config) is None else Z_UP
+            else:
+                layers.append(Layer({"render_asset": config.name}, self.path, "stages.paths."))
+                # Without a config, Habitat-Sim judges by the name, unless the dataset has defaults for its stages.
+                axes = Z_UP if config.name.endswith(".glb") and "default_attributes" not in self._stages else Y_UP
+        name = entry.words.rpartition("/")[2]
+        asset, axes = read_stage([*layers, *entry.changes], folder, self.folder, name=name, axes=axes)
+        return SceneLocation(name, asset, *axes, dataset=self.path, files=files)
+
+    def _instance(self, entry: _Entry) -> SceneLocation:
+        assert entry.file is not None
+        default = member(self._scenes, "default_attributes", {}, f"{self._where}scene_instances.")
+        content = {**default, **read_config(entry.file)}
+        place = content.get("stage_instance")
+        if not isinstance(place, dict) or not isinstance(place.get("template_name"), str):
+            raise SceneError(f"{entry.file}: stage_instance.template_name: expected a stage's, got {shown(place)}")
+        expect_neutral([Layer(place, entry.file, "stage_instance.")], _UNMOVED)
+        kinds = ("object_instances", "articulated_object_instances")
+        objects = sum(len(member(content, kind, [], f"{entry.file}: ")) for kind in kinds)
+        stage = self._stage(self._stage_of(place["template_name"], f"{entry.file}: stage_instance.template_name"))
+        return replace(stage, objects=objects, files=(self.path, entry.file, *stage.files[1:]))
+
+
+def _config_of(file: Path) -> Path:
+    """The stage config that belongs to a mesh: `room.stage_config.json` to `room.glb` and `room.basis.glb`."""
+    config = file.with_name(Path(Path(file.name).stem).stem + STAGE_CONFIG)
+    return config if not file.name.endswith(STAGE_CONFIG) and config.is_file() else file
+
+
+def _matches(wanted: str, *pools: Sequence[_Entry]) -> list[_Entry]:
+    """What a handle means in the first pool and way that fit: all of it, its last part, folders of it, any part.
+
+    Habitat-Sim takes the first of those that hold the text; one that fits better is preferred here, so that Replica's
+    `apartment_0` is not `frl_apartment_0`.
+    """
+    words = wanted.removesuffix(STAGE_CONFIG).removesuffix(SCENE_INSTANCE)
+    tests = (
+        lambda handle: handle == words,
+        lambda handle: handle.endswith(f"/{words}"),
+        lambda handle: f"/{words}/" in f"/{handle}/",
+        lambda handle: words in handle,
+    )
+    found = ([entry for entry in pool if test(entry.words)] for test in tests for pool in pools)
+    return next(filter(None, found), [])
+
+
+def _in_short(names: Sequence[str]) -> str:
+    more = len(names) - _SHOWN_NAMES
+    return ", ".join(names[:_SHOWN_NAMES]) + (f" and {more} more" if more > 0 else "")

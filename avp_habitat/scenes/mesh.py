@@ -22,12 +22,7 @@ _log = logging.getLogger(__name__)
 
 @cache
 def warn_once(scene: str, text: str) -> None:
-    """Log a warning about a scene, one line that Python shows on stderr, once in a process.
-
-    Args:
-        scene: the path as the user wrote it.
-        text: what was found, and what is done with it.
-    """
+    """Log a warning about a scene, named by the path as the user wrote it, once in a process."""
     _log.warning("%s: %s", scene, text)
 
 
@@ -59,11 +54,8 @@ class TexturedMesh:
     def __post_init__(self) -> None:
         """Check the shapes, which are the contract between loaders and renderers."""
         vertices, triangles = len(self.vertices), len(self.triangles)
-        assert self.vertices.shape == (vertices, 3), self.vertices.shape
-        assert self.triangles.shape == (triangles, 3), self.triangles.shape
-        assert self.uv.shape == (vertices, 2), self.uv.shape
-        assert self.colours.shape == (vertices, 3), self.colours.shape
-        assert self.texture_index.shape == (triangles,), self.texture_index.shape
+        found = [each.shape for each in (self.vertices, self.triangles, self.uv, self.colours, self.texture_index)]
+        assert found == [(vertices, 3), (triangles, 3), (vertices, 2), (vertices, 3), (triangles,)], found
 
     @property
     def bounds(self) -> NDArray[np.floating]:
@@ -73,13 +65,13 @@ class TexturedMesh:
 
 def merge(parts: list[TexturedMesh]) -> TexturedMesh:
     """One mesh of several; textures and masks that are the same object are kept once."""
-    offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
+    offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]], dtype=np.int32)
     textures, lookups = _kept_once([part.textures for part in parts])
     masks, mask_lookups = _kept_once([part.masks for part in parts])
     without = [np.full(len(part.triangles), -1) if part.mask_index is None else part.mask_index for part in parts]
     return TexturedMesh(
         np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.triangles + np.int32(at) for part, at in zip(parts, offsets[:-1], strict=True)]),
+        np.concatenate([part.triangles + at for part, at in zip(parts, offsets, strict=True)]),
         np.concatenate([part.uv for part in parts]),
         np.concatenate([part.colours for part in parts]),
         np.concatenate([lookup[part.texture_index] for part, lookup in zip(parts, lookups, strict=True)]),
@@ -153,9 +145,7 @@ def is_hole(mesh: TexturedMesh, triangles: NDArray[np.integer], at: NDArray[np.f
 def without_holes(mesh: TexturedMesh, size_m: float) -> TexturedMesh:
     """The surfaces alone, for who does not look at pictures: of masked triangles the pieces that are there.
 
-    Args:
-        mesh: metres.
-        size_m: how long the pieces' edges are at most (longer ones where there would be millions).
+    The pieces' edges are at most `size_m` metres long (longer where there would be millions of pieces).
     """
     if mesh.mask_index is None:
         return mesh
@@ -215,13 +205,8 @@ def triangulate(
     first = start[polygons]
     step = np.arange(len(polygons)) - begin[polygons]
     places = np.stack([first, first + step + 1, first + step + 2], axis=1)
-    for some in _portions(np.flatnonzero(lengths == 4)):
-        at = start[some]
-        turned = some[_is_bent(*(positions[corners[at + step]].astype(np.float64) for step in range(4)))]
-        # The other diagonal.
-        places[begin[turned]] = start[turned, None] + [1, 2, 3]
-        places[begin[turned] + 1] = start[turned, None] + [1, 3, 0]
-    for some in _portions(np.flatnonzero(lengths > 4)):
+    large = np.flatnonzero(lengths > 3)
+    for some in np.array_split(large, len(large) // _AT_ONCE + 1):
         for polygon, points, normal in _not_convex(some, lengths[some], start[some], corners, positions):
             if len(points) > _MOST_CORNERS:
                 raise ValueError(
@@ -230,19 +215,6 @@ def triangulate(
                 )
             places[begin[polygon] :][: len(points) - 2] = start[polygon] + _ears(points, normal)
     return places, polygons
-
-
-def _portions(indices: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    return np.array_split(indices, len(indices) // _AT_ONCE + 1)
-
-
-def _is_bent(a: NDArray, b: NDArray, c: NDArray, d: NDArray) -> NDArray[np.bool_]:
-    """`(n,)` whether the diagonal from a to c lies outside of a quad: its halves face different ways."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        one, two = np.cross(b - a, c - a), np.cross(c - a, d - a)
-        whole = one + two
-        least = np.minimum((one * whole).sum(axis=1), (two * whole).sum(axis=1))
-        return least < -_STRAIGHT * (whole * whole).sum(axis=1)
 
 
 def _not_convex(

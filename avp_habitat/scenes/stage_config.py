@@ -41,7 +41,7 @@ REPLICA_MESH = "mesh.ply"
 _REPLICA_FILES = ("mesh_semantic.ply", "info_semantic.json", "replica_stage.stage_config.json")
 _HABITAT = "habitat"
 _FILE_NAME_TAG = "%%CONFIG_NAME_AS_ASSET_FILENAME%%"
-_NEUTRAL = {"origin": [0, 0, 0], "scale": [1, 1, 1], "units_to_meters": 1}
+_NEUTRAL = {"origin": ([0, 0, 0],), "scale": ([1, 1, 1],), "units_to_meters": (1,)}
 
 
 @dataclass(frozen=True)
@@ -137,8 +137,7 @@ def read_stage(layers: Sequence[Layer], folder: Path, root: Path, *, name: str, 
     Raises:
         SceneError: an attribute is missing or cannot be right, or moves or scales the stage.
     """
-    for key, neutral in _NEUTRAL.items():
-        expect_neutral(layers, key, neutral)
+    expect_neutral(layers, _NEUTRAL)
     asset = _asset(layers, folder, root, name)
     up, front = _axes(layers, axes)
     if asset.name.endswith("_semantic.ply") and find(layers, "render_asset_type")[0] in (None, "semantic"):
@@ -154,19 +153,20 @@ def find(layers: Sequence[Layer], key: str) -> tuple[Any, Layer]:
     return (found[-1].values[key], found[-1]) if found else (None, layers[-1])
 
 
-def expect_neutral(layers: Sequence[Layer], key: str, *neutral: Any) -> None:
-    """Refuse, by a SceneError, an attribute that moves, turns or scales a stage: all but the `neutral` values.
+def expect_neutral(layers: Sequence[Layer], neutral: Mapping[str, tuple]) -> None:
+    """Refuse, by a SceneError, attributes that move, turn or scale a stage: all but the `neutral` values of each key.
 
     Habitat-Sim 0.3.4 reads origin, units_to_meters and the stage's place in a scene instance without using them, and
     scales what is seen but not the NavMesh; older versions do not scale. No two simulators would show the same scene.
     """
-    value, layer = find(layers, key)
-    if value is None or value in neutral:
-        return
-    raise SceneError(
-        f"{layer.path}: {layer.where}{key}: expected {shown(neutral[0])} or nothing, got {shown(value)}; stages that "
-        "are moved, turned or scaled are not supported, because versions of Habitat-Sim differ in it: change the mesh"
-    )
+    for key, accepted in neutral.items():
+        value, layer = find(layers, key)
+        if value is not None and value not in accepted:
+            raise SceneError(
+                f"{layer.path}: {layer.where}{key}: expected {shown(accepted[0])} or nothing, got {shown(value)}; "
+                "stages that are moved, turned or scaled are not supported, because versions of Habitat-Sim differ in "
+                "it: change the mesh"
+            )
 
 
 def inside(target: Path, root: Path, where: str, value: str) -> Path:
@@ -189,11 +189,9 @@ def shown(value: Any) -> str:
 def _asset(layers: Sequence[Layer], folder: Path, root: Path, name: str) -> Path:
     value, layer = find(layers, "render_asset")
     key = f"{layer.path}: {layer.where}render_asset"
-    if not isinstance(value, str) or not value:
+    if not isinstance(value, str) or Path(value).suffix.lower() not in SUFFIXES:
         raise SceneError(f"{key}: expected the path of a mesh ({', '.join(SUFFIXES)}), got {shown(value)}")
     asset = inside(folder / value.replace(_FILE_NAME_TAG, name), root, key, value)
-    if asset.suffix.lower() not in SUFFIXES:
-        raise SceneError(f"{key}: expected a mesh ({', '.join(SUFFIXES)}), got {shown(value)}")
     if not os.path.isfile(asset):
         raise SceneError(f"{key}: {broken_link(asset) or f'there is no file {asset}'}")
     return asset
@@ -203,17 +201,14 @@ def _axes(layers: Sequence[Layer], default: Axes) -> Axes:
     if all(find(layers, key)[0] is None for key in ("up", "front")):
         return default
     # A config that names one of them gets the other as Habitat-Sim has it, whatever its asset is.
-    (up, layer), (front, _) = (_direction(layers, key, Y_UP[index]) for index, key in enumerate(("up", "front")))
+    up, front = (_direction(layers, key, Y_UP[index]) for index, key in enumerate(("up", "front")))
+    layer = find(layers, "up")[1]
+    told = f"{layer.path}: {layer.where}up and front: got up {shown(list(up))} and front {shown(list(front))}"
     if abs(sum(a * b for a, b in zip(up, front, strict=True))) > 1e-5:
-        raise SceneError(
-            f"{layer.path}: {layer.where}up and front: expected two directions at right angles, got "
-            f"up {shown(list(up))} and front {shown(list(front))}; name both"
-        )
+        raise SceneError(f"{told}; expected two directions at right angles; name both")
     if _is_turned_over(up, front):
-        raise SceneError(
-            f"{layer.path}: {layer.where}up and front: Habitat-Sim shows a stage with up {shown(list(up))} and front "
-            f"{shown(list(front))} upside down; expected another front, {shown([-item or 0.0 for item in front])} say"
-        )
+        other = shown([-item or 0.0 for item in front])
+        raise SceneError(f"{told}, which Habitat-Sim shows upside down; expected another front, {other} say")
     return up, front
 
 
@@ -229,17 +224,12 @@ def _is_turned_over(up: Vector, front: Vector) -> bool:
     return sum(a * b for a, b in zip(before, front, strict=True)) < -1.0 + 2e-5 and abs(up[1]) > 1e-5
 
 
-def _direction(layers: Sequence[Layer], key: str, default: Vector) -> tuple[Vector, Layer]:
+def _direction(layers: Sequence[Layer], key: str, default: Vector) -> Vector:
     value, layer = find(layers, key)
     if value is None:
-        return default, layer
-    if not isinstance(value, list) or len(value) != 3 or not all(_is_number(item) for item in value):
-        raise SceneError(f"{layer.path}: {layer.where}{key}: expected three numbers, got {shown(value)}")
-    length = math.hypot(*value)
+        return default
+    numbers = isinstance(value, list) and len(value) == 3 and all(isinstance(item, (int, float)) for item in value)
+    length = math.hypot(*value) if numbers else 0.0
     if not 0 < length < math.inf:
-        raise SceneError(f"{layer.path}: {layer.where}{key}: expected a direction, got {shown(value)}")
-    return (value[0] / length, value[1] / length, value[2] / length), layer
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        raise SceneError(f"{layer.path}: {layer.where}{key}: expected a direction of three numbers, got {shown(value)}")
+    return (value[0] / length, value[1] / length, value[2] / length)
