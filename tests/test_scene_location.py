@@ -390,7 +390,8 @@ def test_objects_are_counted_and_left_to_habitat(tmp_path):
         ({"rotation": [0, 1, 0, 0]}, r"rotation: expected \[1, 0, 0, 0\] or nothing"),
         ({"uniform_scale": 2}, "uniform_scale: expected 1 or nothing, got 2"),
         ({"non_uniform_scale": [1, 2, 1]}, r"non_uniform_scale: expected \[1, 1, 1\]"),
-        ({"template_name": 3}, "template_name: expected a stage's"),
+        ({"template_name": 3}, "template_name: expected a text, got 3"),
+        ({"template_name": None}, "template_name: all.scene_dataset_config.json has no stage ''"),
         ({"template_name": "hill"}, "template_name: all.scene_dataset_config.json has no stage 'hill'"),
     ],
 )
@@ -411,8 +412,11 @@ def test_a_stage_instance_that_is_not_supported_is_named(tmp_path, place, messag
         ({"stages": {"paths": {".json": ["../*"]}}}, r"stages.paths..json: '../.*' lies outside of"),
         ({"stages": {"paths": {".json": ["a/*/../../../*"]}}}, "lies outside of"),
         ({"stages": {"paths": {".json": ["/etc"]}}}, "'/etc' lies outside of"),
-        ({"stages": {"configs": [{}]}}, r"stages.configs\[0\].attributes: expected an object"),
-        ({"stages": {"configs": [{"attributes": {}}]}}, "expected original_file or template_handle"),
+        ({"stages": {"configs": [3]}}, r"stages.configs\[0\]: expected an object, got 3"),
+        (
+            {"stages": {"configs": [{"attributes": {}}]}},
+            r"stages.configs\[0\].original_file: expected a stage's, or a te",
+        ),
         ({"stages": {"configs": [{"attributes": {}, "original_file": "x"}]}}, "original_file: .* has no stage 'x'"),
         ({"scene_instances": {"default_attributes": 1}}, "scene_instances.default_attributes: expected an object"),
     ],

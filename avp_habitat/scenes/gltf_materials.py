@@ -27,7 +27,7 @@ SUPPORTED = {
     *(f"KHR_materials_{name}" for name in ("sheen", "specular", "volume")),
 }
 """Extensions that a document may require."""
-# Without these, a document that does not require them is shown by what it holds for the purpose; else it is refused.
+# A document that does not require these is shown by what it holds for the purpose; else it is refused.
 _REPLACED = {"EXT_meshopt_compression", "KHR_draco_mesh_compression", "KHR_texture_basisu", "MSFT_texture_dds"}
 _TRANSMISSION = ("KHR_materials_transmission", "KHR_materials_diffuse_transmission")
 _NAMED = 4
@@ -41,7 +41,7 @@ class GltfSurface:
     """`(4,)` colour and alpha that multiply the picture."""
     texture: int | None = None
     coordinates: str = "TEXCOORD_0"
-    """Name of the attribute that holds the texture coordinates."""
+    """The attribute with the texture coordinates."""
     transform: NDArray[np.float32] | None = None
     """`(2, 3)` affine map of the texture coordinates, None to leave them."""
     cutoff: float | None = None

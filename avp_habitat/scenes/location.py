@@ -8,7 +8,6 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from avp_habitat.errors import SceneError, UsageError, did_you_mean
 from avp_habitat.scenes.files import SUFFIXES, broken_link
@@ -20,9 +19,7 @@ from avp_habitat.scenes.stage_config import (
     Layer,
     SceneLocation,
     expect_neutral,
-    inside,
     is_replica_scene,
-    member,
     read_config,
     read_stage,
     replica_scene,
@@ -126,7 +123,7 @@ def _stage(path: Path) -> SceneLocation:
     scene, name = replica_scene(path), path.name.removesuffix(STAGE_CONFIG)
     # Replica's stage config lies in habitat/ and shows ../mesh.ply, so the folder above is part of the data.
     root, axes = Path(os.path.abspath(path)).parents[1], Y_UP if scene is None else Z_UP
-    asset, axes = read_stage([Layer(read_config(path), path)], path.parent, root, name=name, axes=axes)
+    asset, axes = read_stage([read_config(path)], path.parent, root, name=name, axes=axes)
     return SceneLocation(name if scene is None else scene.name, asset, *axes, files=(path,))
 
 
@@ -172,13 +169,13 @@ class _Dataset:
 
     def __init__(self, path: Path) -> None:
         self.path, self.folder = path, path.parent
-        config, self._where = read_config(path), f"{path}: "
-        self._scenes = member(config, "scene_instances", {}, self._where)
-        self._stages = member(config, "stages", {}, self._where)
-        self.scenes = list(self._listed(self._scenes, "scene_instances", SCENE_INSTANCE))
-        self.stages = list(self._listed(self._stages, "stages", STAGE_CONFIG))
-        for index, cell in enumerate(member(self._stages, "configs", [], f"{self._where}stages.")):
-            self._add_configured(cell, f"stages.configs[{index}]")
+        config = read_config(path)
+        self._scenes, self._stages = config.cell("scene_instances"), config.cell("stages")
+        self.scenes = list(self._listed(self._scenes, SCENE_INSTANCE))
+        self.stages = list(self._listed(self._stages, STAGE_CONFIG))
+        for index, cell in enumerate(self._stages.member("configs", [])):
+            listed = Layer({f"configs[{index}]": cell}, path, "stages.")
+            self._add_configured(listed.cell(f"configs[{index}]"))
 
     def scene(self, scene_id: str) -> SceneLocation:
         """The scene of a handle with or without folders and ending, or of a part of it that no other scene has.
@@ -201,80 +198,69 @@ class _Dataset:
         found = self._instance(entry) if entry in self.scenes else self._stage(entry)
         return replace(found, name=entry.name, scene_id=entry.handle)
 
-    def _listed(self, cell: dict[str, Any], key: str, ending: str) -> Iterator[_Entry]:
+    def _listed(self, cell: Layer, ending: str) -> Iterator[_Entry]:
         """Entries of the files that the search paths of a cell lead to."""
-        paths = member(cell, "paths", {}, f"{self._where}{key}.")
-        for kind in paths:
+        paths = cell.cell("paths")
+        for kind in paths.values:
             # Habitat-Sim takes every kind that holds ".json" for one of configs, any other for one of assets.
             wanted = ending if ".json" in kind else kind
-            for pattern in member(paths, kind, [], f"{self._where}{key}.paths."):
-                for file in self._files(pattern, f"{self._where}{key}.paths.{kind}", wanted):
-                    yield _Entry(file, self.folder / file)
+            for pattern in paths.member(kind, []):
+                if not isinstance(pattern, str) or not pattern or "\0" in pattern:
+                    raise paths.error(kind, f"expected a path, got {shown(pattern)}")
+                for match in sorted(glob.glob(pattern, root_dir=self.folder)):
+                    path = paths.inside(kind, match, self.folder, self.folder)
+                    files = sorted(path.iterdir()) if path.is_dir() else [path]
+                    found = (file for file in files if file.name.endswith(wanted))
+                    yield from (_Entry(os.path.relpath(file, self.folder), file) for file in found)
 
-    def _files(self, pattern: Any, where: str, ending: str) -> list[str]:
-        """Paths relative to the dataset's folder of what a pattern matches, and of what lies in matching folders."""
-        if not isinstance(pattern, str) or not pattern or "\0" in pattern:
-            raise SceneError(f"{where}: expected a path, got {shown(pattern)}")
-        found = []
-        for match in sorted(glob.glob(pattern, root_dir=self.folder)):
-            path = inside(self.folder / match, self.folder, where, match)
-            names = [f"{match.rstrip('/')}/{name}" for name in sorted(os.listdir(path))] if path.is_dir() else [match]
-            found += [os.path.normpath(name) for name in names if name.endswith(ending)]
-        return found
-
-    def _add_configured(self, cell: Any, where: str) -> None:
+    def _add_configured(self, cell: Layer) -> None:
         """A stage that the dataset config describes itself, or one of its files with changes."""
-        if not isinstance(cell, dict) or not isinstance(cell.get("attributes"), dict):
-            raise SceneError(f"{self.path}: {where}.attributes: expected an object, got {shown(cell)}")
-        change = Layer(cell["attributes"], self.path, f"{where}.attributes.")
-        told = f"{self._where}{where}."
-        origin, handle = (member(cell, key, "", told) for key in ("original_file", "template_handle"))
-        if origin:
-            before = self._stage_of(origin, f"{told}original_file")
+        change = cell.cell("attributes")
+        handle = cell.member("template_handle", "")
+        if cell.member("original_file", ""):
+            before = self._stage_of(cell, "original_file")
             if not handle:
                 self.stages.remove(before)
             self.stages.append(_Entry(handle or before.handle, before.file, (*before.changes, change)))
         elif handle:
             self.stages.append(_Entry(handle, None, (change,)))
         else:
-            raise SceneError(f"{self.path}: {where}: expected original_file or template_handle")
+            raise cell.error("original_file", "expected a stage's, or a template_handle beside it")
 
-    def _stage_of(self, handle: str, where: str) -> _Entry:
-        if matches := _matches(handle, self.stages):
+    def _stage_of(self, layer: Layer, key: str) -> _Entry:
+        handle = layer.member(key, "")
+        if handle and (matches := _matches(handle, self.stages)):
             return matches[0]
         hint = did_you_mean(handle, [entry.words for entry in self.stages])
-        raise SceneError(f"{where}: {self.path.name} has no stage {handle!r}{hint}")
+        raise layer.error(key, f"{self.path.name} has no stage {handle!r}{hint}")
 
     def _stage(self, entry: _Entry) -> SceneLocation:
-        default = member(self._stages, "default_attributes", {}, f"{self._where}stages.")
-        layers = [Layer(default, self.path, "stages.default_attributes.")]
+        layers = [self._stages.cell("default_attributes")]
         folder, files, axes = self.folder, (self.path,), Y_UP
         if entry.file is not None:
             config = _config_of(entry.file)
             folder = config.parent
             if config.name.endswith(STAGE_CONFIG):
-                layers.append(Layer(read_config(config), config))
+                layers.append(read_config(config))
                 files = (self.path, config)
                 axes = Y_UP if replica_scene(config) is None else Z_UP
             else:
                 layers.append(Layer({"render_asset": config.name}, self.path, "stages.paths."))
                 # Without a config, Habitat-Sim judges by the name, unless the dataset has defaults for its stages.
-                axes = Z_UP if config.name.endswith(".glb") and "default_attributes" not in self._stages else Y_UP
+                z_up = config.name.endswith(".glb") and "default_attributes" not in self._stages.values
+                axes = Z_UP if z_up else Y_UP
         name = entry.words.rpartition("/")[2]
         asset, axes = read_stage([*layers, *entry.changes], folder, self.folder, name=name, axes=axes)
         return SceneLocation(name, asset, *axes, dataset=self.path, files=files)
 
     def _instance(self, entry: _Entry) -> SceneLocation:
         assert entry.file is not None
-        default = member(self._scenes, "default_attributes", {}, f"{self._where}scene_instances.")
-        content = {**default, **read_config(entry.file)}
-        place = content.get("stage_instance")
-        if not isinstance(place, dict) or not isinstance(place.get("template_name"), str):
-            raise SceneError(f"{entry.file}: stage_instance.template_name: expected a stage's, got {shown(place)}")
-        expect_neutral([Layer(place, entry.file, "stage_instance.")], _UNMOVED)
-        kinds = ("object_instances", "articulated_object_instances")
-        objects = sum(len(member(content, kind, [], f"{entry.file}: ")) for kind in kinds)
-        stage = self._stage(self._stage_of(place["template_name"], f"{entry.file}: stage_instance.template_name"))
+        default, own = self._scenes.cell("default_attributes"), read_config(entry.file)
+        content = Layer({**default.values, **own.values}, entry.file)
+        place = content.cell("stage_instance")
+        expect_neutral([place], _UNMOVED)
+        objects = sum(len(content.member(kind, [])) for kind in ("object_instances", "articulated_object_instances"))
+        stage = self._stage(self._stage_of(place, "template_name"))
         return replace(stage, objects=objects, files=(self.path, entry.file, *stage.files[1:]))
 
 
