@@ -121,12 +121,10 @@ def _least_and_most(mask: NDArray[np.bool_], uv: NDArray[np.float32]) -> tuple[N
 
 
 def is_hole(mesh: TexturedMesh, triangles: NDArray[np.integer], at: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Whether points of triangles lie in holes; the texel that they lie in decides.
+    """Whether points lie in holes of a mesh with masks; the texel that they lie in decides.
 
-    Args:
-        mesh: with masks.
-        triangles: `(n,)` indices; those that the mesh does not have are no holes.
-        at: `(n, 2)` barycentric coordinates, shares of the second and third corner.
+    Points have `(n,)` triangles, of which those that the mesh does not have are no holes, and `(n, 2)` shares of the
+    second and third corner.
     """
     assert mesh.mask_index is not None
     result = np.zeros(len(triangles), bool)
@@ -193,7 +191,7 @@ def triangulate(
         positions: `(v, 3)` of the vertices.
 
     Returns:
-        `(t, 3)` places of the triangles' corners in the list of all corners, and `(t,)` the polygons they are of.
+        `(t, 3)` places in the list of all corners, and `(t,)` the polygons that the triangles are of.
 
     Raises:
         ValueError: a polygon that is not convex has so many corners that to cut it would take minutes.

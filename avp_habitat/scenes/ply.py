@@ -120,12 +120,6 @@ def _numbers(text: bytes) -> bytes:
 def _read(element: _Element, body: bytes, start: int) -> tuple[_Columns, int]:
     """The columns of an element whose rows start at a byte of the body, and where they end."""
     properties, rows = element.properties, element.rows
-    least = sum((each.count or each.values).itemsize for each in properties)
-    if rows * least > len(body) - start:
-        raise ValueError(
-            f"truncated: the header announces {rows} rows of {element.name}, for which {len(body) - start} bytes are "
-            f"left where at least {rows * least} are needed"
-        )
     if not rows or not properties:
         return {}, start
     lengths = _walk(element, body, start, 1)[0][0, :, 1].tolist()
@@ -149,11 +143,10 @@ def _table(element: _Element, body: bytes, start: int, lengths: list[int]) -> ND
     for number, (each, length) in enumerate(zip(element.properties, lengths, strict=True)):
         fields += [] if each.count is None else [(f"count {number}", each.count)]
         fields.append((f"values {number}", each.values, (length,)))
-    row = np.dtype(fields)
-    if row.itemsize * element.rows > len(body) - start:
+    row, lists = np.dtype(fields), [number for number, each in enumerate(element.properties) if each.count is not None]
+    if lists and row.itemsize * element.rows > len(body) - start:
         return None
     table = np.frombuffer(body, row, element.rows, start)
-    lists = [number for number, each in enumerate(element.properties) if each.count is not None]
     return table if all((table[f"count {number}"] == lengths[number]).all() for number in lists) else None
 
 
@@ -250,9 +243,8 @@ def _texture_index(face: _Columns, faces: NDArray[np.int64], textures: int) -> N
 
 
 def _warn_of_unread_colours(files: SceneFiles, properties: list[str], pictures: list[str]) -> None:
-    names = [name for name in properties if _COLOUR_LIKE.search(name)]
-    if names:
-        known = "colours are read from " + ", ".join("/".join(each) for each in _COLOURS)
-        warn_once(str(files.path), f"is shown white: its {', '.join(names)} are not followed ({known})")
+    if names := [name for name in properties if _COLOUR_LIKE.search(name)]:
+        known = ", ".join("/".join(each) for each in _COLOURS)
+        warn_once(str(files.path), f"is shown white: its {', '.join(names)} are not followed (known are {known})")
     elif pictures:
         warn_once(str(files.path), f"is shown white: it names {', '.join(pictures)}, but has no texture coordinates")

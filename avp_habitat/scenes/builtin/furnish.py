@@ -14,8 +14,8 @@ from avp_habitat.scenes.builtin.noise import Random
 from avp_habitat.scenes.builtin.shapes import Float, MeshSurface, Rectangle, moved
 from avp_habitat.scenes.builtin.shell import CURTAIN_M, Point, Shell, Wall, curtain_bottom
 
-CELL_M = 0.1
-RADIUS_M = 0.15
+_CELL_M = 0.1
+_RADIUS_M = 0.15
 """The agent's radius and half a cell, so that the answer errs on the safe side."""
 _QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 """Cosine and sine of quarter turns."""
@@ -30,25 +30,6 @@ _Spots = Callable[[Wall], list[Point]]
 _MOST_SPOTS = 120
 
 
-def free_cells(shell: Shell, blocks: list[Rectangle]) -> NDArray[np.bool_]:
-    """`(rows, columns)` cells of 0.1 m, rows along z, where an agent can stand.
-
-    Args:
-        shell: the empty room.
-        blocks: x0, z0, x1, z1 in metres of what stands on the floor.
-    """
-    x0, z0, x1, z1 = shell.bounds
-    x = np.arange(x0 + CELL_M / 2, x1, CELL_M)
-    z = np.arange(z0 + CELL_M / 2, z1, CELL_M)
-    free = ((z > z0 + RADIUS_M) & (z < z1 - RADIUS_M))[:, None] & ((x > x0 + RADIUS_M) & (x < x1 - RADIUS_M))[None]
-    notch = [shell.notch] if shell.notch is not None else []
-    for a, b, c, d in [*blocks, *notch]:
-        rows = slice(*np.searchsorted(z, (b - RADIUS_M, d + RADIUS_M)))
-        columns = slice(*np.searchsorted(x, (a - RADIUS_M, c + RADIUS_M)))
-        free[rows, columns] = False
-    return free
-
-
 def largest_part(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The largest 4-connected part of a mask."""
     parts, _ = label(free)  # pyright: ignore[reportGeneralTypeIssues]
@@ -57,13 +38,19 @@ def largest_part(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return free & (parts == sizes.argmax())
 
 
-def walkable_share(shell: Shell, blocks: list[Rectangle]) -> float:
-    """Share of the floor in the largest walkable part; 0 where other parts come to more than 0.3 m²."""
-    free = free_cells(shell, blocks)
-    part = largest_part(free)
-    if (int(free.sum()) - int(part.sum())) * CELL_M**2 > 0.3:
-        return 0.0
-    return int(part.sum()) * CELL_M**2 / shell.floor_area
+def _walkable_share(shell: Shell, blocks: list[Rectangle]) -> float:
+    """Share of the floor in the largest walkable part beside blocks; 0 where other parts come to more than 0.3 m²."""
+    x0, z0, x1, z1 = shell.bounds
+    x = np.arange(x0 + _CELL_M / 2, x1, _CELL_M)
+    z = np.arange(z0 + _CELL_M / 2, z1, _CELL_M)
+    inside_x = (x > x0 + _RADIUS_M) & (x < x1 - _RADIUS_M)
+    free = ((z > z0 + _RADIUS_M) & (z < z1 - _RADIUS_M))[:, None] & inside_x
+    for a, b, c, d in filter(None, [*blocks, shell.notch]):
+        rows = slice(*np.searchsorted(z, (b - _RADIUS_M, d + _RADIUS_M)))
+        columns = slice(*np.searchsorted(x, (a - _RADIUS_M, c + _RADIUS_M)))
+        free[rows, columns] = False
+    part = int(largest_part(free).sum())
+    return 0.0 if (int(free.sum()) - part) * _CELL_M**2 > 0.3 else part * _CELL_M**2 / shell.floor_area
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +61,8 @@ class Placed:
     axes: Float
     """`(3, 3)` columns are the piece's x, y and z in the world."""
     position: Point
-    """x, z of its foot in metres."""
     footprint: Rectangle
-    """x0, z0, x1, z1 of the axis-aligned rectangle that it keeps to."""
+    """The axis-aligned rectangle that it keeps to."""
 
     def surfaces(self) -> list[MeshSurface]:
         """Its triangles in the world frame."""
@@ -151,7 +137,7 @@ class FloorPlan:
         if self._are_in_the_way(solids, rugs, areas):
             return False
         rectangles = [(b.x0, b.z0, b.x1, b.z1) for b in [*self.blocks, *solids] if b.solid]
-        if walkable_share(self.shell, rectangles) < least_share:
+        if _walkable_share(self.shell, rectangles) < least_share:
             return False
         self.placed += stands
         self.blocks += solids + areas

@@ -105,9 +105,9 @@ def panel(
     """A flat rectangle, subdivided so that light can vary over it; all lengths are in metres.
 
     Args:
-        corner: upper left corner as seen from the front.
-        right: edge from there to the right.
-        down: edge from there downwards.
+        corner: upper left corner as seen from the front, from where the edges `right` and `down` lead.
+        right: edge vector.
+        down: edge vector.
         material: whose picture measures metres along `right` and `down`, from `origin` on.
         pitch: largest distance between vertices.
         fit: part of the picture (u0, v0, u1, v1) to stretch over the rectangle instead.
