@@ -18,7 +18,7 @@ from avp_habitat.scenes.stage_config import (
     Z_UP,
     Layer,
     SceneLocation,
-    expect_neutral,
+    expect_unmoved,
     is_replica_scene,
     read_config,
     read_stage,
@@ -32,13 +32,6 @@ UPS = ("y", "z")
 DATASET_CONFIG = ".scene_dataset_config.json"
 SCENE_INSTANCE = ".scene_instance.json"
 _SHOWN_NAMES = 5
-_UNMOVED = {
-    "translation": ([0, 0, 0],),
-    "rotation": ([1, 0, 0, 0], [-1, 0, 0, 0]),
-    "uniform_scale": (1,),
-    "non_uniform_scale": ([1, 1, 1],),
-}
-"""Values of a stage's place in a scene instance that leave it where it is."""
 HELP = (
     f"a mesh ({' '.join(SUFFIXES)}), a scene folder of Replica, NAME{STAGE_CONFIG}, NAME{DATASET_CONFIG}:ID, or "
     f"{BUILTIN}SEED for a generated room"
@@ -143,14 +136,11 @@ def _expect_file(path: Path, endings: tuple[str, ...]) -> None:
 
 @dataclass(frozen=True)
 class _Entry:
-    """A scene instance or a stage of a dataset."""
+    """A scene instance or a stage of a dataset: its config, or the mesh of a stage without one."""
 
     handle: str
-    """Path of its file relative to the dataset's folder, or the handle that the dataset config gives it."""
-    file: Path | None
-    """Its config, or the mesh of a stage without one; None for a stage that the dataset config holds itself."""
-    changes: tuple[Layer, ...] = ()
-    """Attributes from the dataset config that override those of `file`."""
+    """The file's path relative to the dataset's folder."""
+    file: Path
 
     @property
     def words(self) -> str:
@@ -160,7 +150,7 @@ class _Entry:
     @property
     def name(self) -> str:
         """The handle without folders and the ending of configs; of a stage of Replica the name of its scene."""
-        scene = None if self.file is None else replica_scene(self.file)
+        scene = replica_scene(self.file)
         return self.words.rpartition("/")[2] if scene is None else scene.name
 
 
@@ -173,9 +163,8 @@ class _Dataset:
         self._scenes, self._stages = config.cell("scene_instances"), config.cell("stages")
         self.scenes = list(self._listed(self._scenes, SCENE_INSTANCE))
         self.stages = list(self._listed(self._stages, STAGE_CONFIG))
-        for index, cell in enumerate(self._stages.member("configs", [])):
-            listed = Layer({f"configs[{index}]": cell}, path, "stages.")
-            self._add_configured(listed.cell(f"configs[{index}]"))
+        if self._stages.values.get("configs"):
+            raise self._stages.error("configs", "stages that a dataset config describes itself are not supported")
 
     def scene(self, scene_id: str) -> SceneLocation:
         """The scene of a handle with or without folders and ending, or of a part of it that no other scene has.
@@ -184,13 +173,13 @@ class _Dataset:
         """
         every = [*self.scenes, *self.stages]
         names = sorted({entry.name for entry in every})
-        examples = f"it has {len(names)} scenes" + (f": {_in_short(names)}" if names else "")
+        examples = f"it has {len(names)} scenes" + (f", such as {', '.join(names[:_SHOWN_NAMES])}" if names else "")
         if not scene_id:
             raise UsageError(f"{self.path}: expected {self.path.name}:ID with the id of a scene; {examples}")
         matches = _matches(scene_id, self.scenes, self.stages)
         if len(matches) > 1:
-            handles = _in_short([entry.handle for entry in matches])
-            raise SceneError(f"{self.path}: {scene_id!r} stands for {len(matches)} scenes: {handles}")
+            some = ", ".join(entry.handle for entry in matches[:_SHOWN_NAMES])
+            raise SceneError(f"{self.path}: {scene_id!r} stands for {len(matches)} scenes, such as {some}")
         if not matches:
             hint = did_you_mean(scene_id, sorted({*names, *(each.words for each in every)}))
             raise SceneError(f"{self.path}: has no scene {scene_id!r}; {examples}{hint}")
@@ -213,54 +202,34 @@ class _Dataset:
                     found = (file for file in files if file.name.endswith(wanted))
                     yield from (_Entry(os.path.relpath(file, self.folder), file) for file in found)
 
-    def _add_configured(self, cell: Layer) -> None:
-        """A stage that the dataset config describes itself, or one of its files with changes."""
-        change = cell.cell("attributes")
-        handle = cell.member("template_handle", "")
-        if cell.member("original_file", ""):
-            before = self._stage_of(cell, "original_file")
-            if not handle:
-                self.stages.remove(before)
-            self.stages.append(_Entry(handle or before.handle, before.file, (*before.changes, change)))
-        elif handle:
-            self.stages.append(_Entry(handle, None, (change,)))
-        else:
-            raise cell.error("original_file", "expected a stage's, or a template_handle beside it")
-
-    def _stage_of(self, layer: Layer, key: str) -> _Entry:
-        handle = layer.member(key, "")
-        if handle and (matches := _matches(handle, self.stages)):
-            return matches[0]
-        hint = did_you_mean(handle, [entry.words for entry in self.stages])
-        raise layer.error(key, f"{self.path.name} has no stage {handle!r}{hint}")
-
     def _stage(self, entry: _Entry) -> SceneLocation:
-        layers = [self._stages.cell("default_attributes")]
-        folder, files, axes = self.folder, (self.path,), Y_UP
-        if entry.file is not None:
-            config = _config_of(entry.file)
-            folder = config.parent
-            if config.name.endswith(STAGE_CONFIG):
-                layers.append(read_config(config))
-                files = (self.path, config)
-                axes = Y_UP if replica_scene(config) is None else Z_UP
-            else:
-                layers.append(Layer({"render_asset": config.name}, self.path, "stages.paths."))
-                # Without a config, Habitat-Sim judges by the name, unless the dataset has defaults for its stages.
-                z_up = config.name.endswith(".glb") and "default_attributes" not in self._stages.values
-                axes = Z_UP if z_up else Y_UP
+        layers, config = [self._stages.cell("default_attributes")], _config_of(entry.file)
+        if config.name.endswith(STAGE_CONFIG):
+            layers.append(read_config(config))
+            files = (self.path, config)
+            axes = Y_UP if replica_scene(config) is None else Z_UP
+        else:
+            layers.append(Layer({"render_asset": config.name}, self.path, "stages.paths."))
+            files = (self.path,)
+            # Without a config, Habitat-Sim judges by the name, unless the dataset has defaults for its stages.
+            z_up = config.name.endswith(".glb") and "default_attributes" not in self._stages.values
+            axes = Z_UP if z_up else Y_UP
         name = entry.words.rpartition("/")[2]
-        asset, axes = read_stage([*layers, *entry.changes], folder, self.folder, name=name, axes=axes)
+        asset, axes = read_stage(layers, config.parent, self.folder, name=name, axes=axes)
         return SceneLocation(name, asset, *axes, dataset=self.path, files=files)
 
     def _instance(self, entry: _Entry) -> SceneLocation:
-        assert entry.file is not None
         default, own = self._scenes.cell("default_attributes"), read_config(entry.file)
         content = Layer({**default.values, **own.values}, entry.file)
         place = content.cell("stage_instance")
-        expect_neutral([place], _UNMOVED)
+        expect_unmoved([place])
+        handle = place.member("template_name", "")
+        matches = _matches(handle, self.stages) if handle else []
+        if not matches:
+            hint = did_you_mean(handle, [each.words for each in self.stages])
+            raise place.error("template_name", f"{self.path.name} has no stage {handle!r}{hint}")
         objects = sum(len(content.member(kind, [])) for kind in ("object_instances", "articulated_object_instances"))
-        stage = self._stage(self._stage_of(place, "template_name"))
+        stage = self._stage(matches[0])
         return replace(stage, objects=objects, files=(self.path, entry.file, *stage.files[1:]))
 
 
@@ -285,8 +254,3 @@ def _matches(wanted: str, *pools: Sequence[_Entry]) -> list[_Entry]:
     )
     found = ([entry for entry in pool if test(entry.words)] for test in tests for pool in pools)
     return next(filter(None, found), [])
-
-
-def _in_short(names: Sequence[str]) -> str:
-    more = len(names) - _SHOWN_NAMES
-    return ", ".join(names[:_SHOWN_NAMES]) + (f" and {more} more" if more > 0 else "")

@@ -34,7 +34,8 @@ REPLICA_MESH = "mesh.ply"
 _REPLICA_FILES = ("mesh_semantic.ply", "info_semantic.json", "replica_stage.stage_config.json")
 _HABITAT = "habitat"
 _FILE_NAME_TAG = "%%CONFIG_NAME_AS_ASSET_FILENAME%%"
-_NEUTRAL = {"origin": ([0, 0, 0],), "scale": ([1, 1, 1],), "units_to_meters": (1,)}
+_NEUTRAL = {"origin": [0, 0, 0], "scale": [1, 1, 1], "units_to_meters": 1}
+_NEUTRAL |= {"translation": [0, 0, 0], "rotation": [1, 0, 0, 0], "uniform_scale": 1, "non_uniform_scale": [1, 1, 1]}
 
 
 @dataclass(frozen=True)
@@ -142,7 +143,7 @@ def read_stage(layers: Sequence[Layer], folder: Path, root: Path, *, name: str, 
     Raises:
         SceneError: an attribute is missing or cannot be right, or moves or scales the stage.
     """
-    expect_neutral(layers, _NEUTRAL)
+    expect_unmoved(layers)
     asset = _asset(layers, folder, root, name)
     up, front = _axes(layers, axes)
     if asset.name.endswith("_semantic.ply") and find(layers, "render_asset_type")[0] in (None, "semantic"):
@@ -158,16 +159,16 @@ def find(layers: Sequence[Layer], key: str) -> tuple[Any, Layer]:
     return (found[-1].values[key], found[-1]) if found else (None, layers[-1])
 
 
-def expect_neutral(layers: Sequence[Layer], neutral: Mapping[str, tuple]) -> None:
-    """Refuse, by a SceneError, attributes that move, turn or scale a stage: all but the `neutral` values of each key.
+def expect_unmoved(layers: Sequence[Layer]) -> None:
+    """Refuse, by a SceneError, attributes of a stage, or of its place in a scene, that move, turn or scale it.
 
     Habitat-Sim 0.3.4 reads origin, units_to_meters and the stage's place in a scene instance without using them, and
     scales what is seen but not the NavMesh; older versions do not scale. No two simulators would show the same scene.
     """
-    for key, accepted in neutral.items():
+    for key, neutral in _NEUTRAL.items():
         value, layer = find(layers, key)
-        if value is not None and value not in accepted:
-            text = f"expected {shown(accepted[0])} or nothing, got {shown(value)}; stages that are moved, turned or "
+        if value is not None and value != neutral:
+            text = f"expected {shown(neutral)} or nothing, got {shown(value)}; stages that are moved, turned or "
             raise layer.error(key, text + "scaled are not supported, because versions of Habitat-Sim differ in it")
 
 

@@ -58,7 +58,7 @@ MISTAKES = [
     (
         f"--scene {DATASET}:withs",
         1,
-        r".*: has no scene 'withs'; it has 3 scenes: room, with, .*; did you mean 'with\b.*'\?",
+        r".*: has no scene 'withs'; it has 3 scenes, such as room, with, .*; did you mean 'with\b.*'\?",
     ),
     (
         "--scene room.glb --gpu 99",

@@ -10,7 +10,7 @@ from scipy.ndimage import uniform_filter
 from avp_habitat.scenes.builtin.furnish import Placed, furnish
 from avp_habitat.scenes.builtin.kit import Kit, Lamp
 from avp_habitat.scenes.builtin.noise import Random
-from avp_habitat.scenes.builtin.shapes import Float, MeshSurface, joined
+from avp_habitat.scenes.builtin.shapes import Float, MeshSurface, by_material
 from avp_habitat.scenes.builtin.shell import Shell, build_shell, plan_shell
 from avp_habitat.scenes.mesh import TexturedMesh, merge
 
@@ -55,7 +55,7 @@ def generate_room(seed: int) -> TexturedMesh:
     for stand in placed:
         surfaces += stand.surfaces()
     lamps = [lamp for stand in placed for lamp in stand.lamps()]
-    surfaces = [replace(s, vertices=_snapped(s.vertices), uv=_snapped(s.uv)) for s in joined(surfaces)]
+    surfaces = [replace(s, vertices=_snapped(s.vertices), uv=_snapped(s.uv)) for s in by_material(surfaces)]
     colours = _bake(shell, surfaces, lamps)
     return merge([_mesh(surface, colour) for surface, colour in zip(surfaces, colours, strict=True)])
 
@@ -152,12 +152,11 @@ def _bake(shell: Shell, surfaces: list[MeshSurface], lamps: list[Lamp]) -> list[
     openness = _open_sky(voxels, points, normals)
     ambient = openness * (0.76 + 0.05 * normals[:, 1]).astype(np.float32)
     light = ambient[:, None] * np.array([1.0, 0.99, 0.97], np.float32)
-    for position, strength in _windows(shell):
-        daylight = _from_lamp(voxels, points, normals, position, 2.4) * np.float32(strength)
-        light += daylight[:, None] * np.array([0.97, 1.0, 1.04], np.float32)
-    for lamp in lamps:
-        warm = _from_lamp(voxels, points, normals, np.asarray(lamp.position), 0.9) * np.float32(lamp.strength)
-        light += warm[:, None] * np.array([1.05, 0.92, 0.7], np.float32)
+    lights = [(position, strength, 2.4, (0.97, 1.0, 1.04)) for position, strength in _windows(shell)]
+    lights += [(np.asarray(lamp.position), lamp.strength, 0.9, (1.05, 0.92, 0.7)) for lamp in lamps]
+    for position, strength, reach, colour in lights:
+        falling = _from_lamp(voxels, points, normals, position, reach) * np.float32(strength)
+        light += falling[:, None] * np.array(colour, np.float32)
     light = np.where(light > 0.8, 0.8 + (light - 0.8) * 0.45, light)
     parts = np.split(np.clip(light, 0, 1), np.cumsum([len(surface.vertices) for surface in surfaces])[:-1])
     return [

@@ -300,17 +300,9 @@ def leaned(surfaces: list[MeshSurface], angle: float) -> list[MeshSurface]:
     return moved(surfaces, np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]]), np.zeros(3))
 
 
-def joined(surfaces: list[MeshSurface]) -> list[MeshSurface]:
-    """The same triangles with one surface per material, in order of first appearance."""
-    by_material: dict[int, list[MeshSurface]] = {}
+def by_material(surfaces: list[MeshSurface]) -> list[MeshSurface]:
+    """The same surfaces with those of one material together, in order of first appearance."""
+    groups: dict[int, list[MeshSurface]] = {}
     for surface in surfaces:
-        by_material.setdefault(id(surface.material), []).append(surface)
-    made = []
-    for parts in by_material.values():
-        starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-        triangles = [part.triangles + np.int32(start) for part, start in zip(parts, starts, strict=True)]
-        vertices, normals, uv = (
-            np.concatenate([getattr(part, name) for part in parts]) for name in ("vertices", "normals", "uv")
-        )
-        made.append(MeshSurface(vertices, normals, uv, np.concatenate(triangles), parts[0].material))
-    return made
+        groups.setdefault(id(surface.material), []).append(surface)
+    return [surface for group in groups.values() for surface in group]
