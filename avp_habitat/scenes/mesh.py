@@ -133,9 +133,8 @@ def is_hole(mesh: TexturedMesh, triangles: NDArray[np.integer], at: NDArray[np.f
     for number in np.unique(index[index >= 0]):
         rays = valid[index == number]
         mask = mesh.masks[number]
-        a, b, c = np.moveaxis(mesh.uv[mesh.triangles[triangles[rays]]].astype(np.float64), 1, 0)
-        u, v = at[rays, :1], at[rays, 1:]
-        texel = np.floor((a + u * (b - a) + v * (c - a)) * mask.shape[::-1]).astype(np.int64) % mask.shape[::-1]
+        uv = _between(mesh.uv[mesh.triangles[triangles[rays]]], at[rays])
+        texel = np.floor(uv * mask.shape[::-1]).astype(np.int64) % mask.shape[::-1]
         result[rays] = ~mask[texel[:, 1], texel[:, 0]]
     return result
 
@@ -153,7 +152,8 @@ def without_holes(mesh: TexturedMesh, size_m: float) -> TexturedMesh:
     pieces = np.tile(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), (len(masked), 1, 1))
     owner, done = masked, []
     while len(owner):
-        points = _points(mesh, owner, pieces)
+        corners = mesh.vertices[mesh.triangles[owner]]
+        points = np.stack([_between(corners, pieces[:, corner]) for corner in range(3)], axis=1)
         longest = np.sqrt(((points - np.roll(points, 1, axis=1)) ** 2).sum(axis=2)).max(axis=1)
         small = (longest <= size_m) | (4 * len(owner) > _MOST_PIECES)
         there = small & ~is_hole(mesh, owner, pieces.mean(axis=1))
@@ -166,10 +166,10 @@ def without_holes(mesh: TexturedMesh, size_m: float) -> TexturedMesh:
     return merge([replace(whole, mask_index=None, masks=[]), there])
 
 
-def _points(mesh: TexturedMesh, owner: NDArray, pieces: NDArray) -> NDArray:
-    """`(n, 3, 3)` corners in metres of `(n, 3, 2)` pieces of triangles."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles[owner]].astype(np.float64), 1, 0)
-    return a[:, None] + pieces[..., :1] * (b - a)[:, None] + pieces[..., 1:] * (c - a)[:, None]
+def _between(corners: NDArray, at: NDArray) -> NDArray:
+    """`(n, k)` values at `(n, 2)` barycentric coordinates of triangles with `(n, 3, k)` values at their corners."""
+    a, b, c = np.moveaxis(corners.astype(np.float64), 1, 0)
+    return a + at[:, :1] * (b - a) + at[:, 1:] * (c - a)
 
 
 def _in_four(pieces: NDArray) -> NDArray:

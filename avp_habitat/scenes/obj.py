@@ -109,13 +109,19 @@ class _Reader:
         self._names: dict[str | None, int] = {None: 0}
         self._material = 0
         self._library: dict[str, _Material] = {}
-        self._takes = {"v": self._vertex, "vt": self._coordinate, "f": self._face, "usemtl": self._use}
-        self._takes["mtllib"] = self._read_library
 
     def take(self, word: str, rest: str) -> None:
         """Read one line; what is not known has no surface. ValueError where it cannot be right."""
-        if word in self._takes:
-            self._takes[word](rest)
+        if word == "v":
+            self._vertex(rest)
+        elif word == "vt":
+            self._coordinates.append([*map(float, _words(rest)[:2]), 0.0, 0.0][:2])
+        elif word == "f":
+            self._face(rest)
+        elif word == "usemtl":
+            self._material = self._names.setdefault(rest, len(self._names))
+        elif word == "mtllib":
+            self._read_library(rest)
 
     def mesh(self) -> TexturedMesh:
         """All faces; SceneError where there are none, or one names a vertex that is not there."""
@@ -161,9 +167,6 @@ class _Reader:
         self._positions.append(numbers[:3])
         self._light.append(numbers[3:6] if len(numbers) >= 6 else [1.0, 1.0, 1.0])
 
-    def _coordinate(self, rest: str) -> None:
-        self._coordinates.append([*map(float, _words(rest)[:2]), 0.0, 0.0][:2])
-
     def _face(self, rest: str) -> None:
         """Corners `v`, `v/vt`, `v//vn` or `v/vt/vn`."""
         words = _words(rest)
@@ -172,9 +175,6 @@ class _Reader:
             of_vertex = _index(vertex, len(self._positions))
             self._corners.append((of_vertex, _index(coordinate, len(self._coordinates)) if coordinate else -1))
         self._faces.append((len(words), self._material))
-
-    def _use(self, rest: str) -> None:
-        self._material = self._names.setdefault(rest, len(self._names))
 
     def _read_library(self, rest: str) -> None:
         """A name with spaces, or several names."""

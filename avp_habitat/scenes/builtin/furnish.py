@@ -80,26 +80,23 @@ class Placed:
 
 @dataclass(frozen=True)
 class Block:
-    """An axis-aligned box that furniture occupies or that must stay free."""
+    """A box over a rectangle that furniture occupies or that must stay free, between two heights in metres."""
 
-    x0: float
-    z0: float
-    x1: float
-    z1: float
+    area: Rectangle
     low: float = 0.0
     high: float = 2.0
     solid: bool = True
 
     def meets(self, other: "Block", margin: float = 0.0) -> bool:
         """Whether two boxes come closer than the margin on the floor and overlap in height."""
-        along_x = self.x0 < other.x1 + margin and other.x0 < self.x1 + margin
-        along_z = self.z0 < other.z1 + margin and other.z0 < self.z1 + margin
-        return along_x and along_z and self.low < other.high and other.low < self.high
+        (a, b, c, d), (x0, z0, x1, z1) = self.area, other.area
+        close = a < x1 + margin and x0 < c + margin and b < z1 + margin and z0 < d + margin
+        return close and self.low < other.high and other.low < self.high
 
     @property
     def flat(self) -> "Block":
         """The same rectangle from the floor to 2 m."""
-        return Block(self.x0, self.z0, self.x1, self.z1)
+        return Block(self.area)
 
 
 class FloorPlan:
@@ -128,16 +125,14 @@ class FloorPlan:
             return False
         solids, rugs = [], []
         for stand in stands:
-            (rugs if stand.piece.height <= FLAT_M else solids).append(Block(*stand.footprint, 0.03, stand.piece.height))
+            (rugs if stand.piece.height <= FLAT_M else solids).append(Block(stand.footprint, 0.03, stand.piece.height))
         areas = [
             _before(wall, (right + a, inwards + b, right + c, inwards + d), 0.03, 1.9) for a, b, c, d in group.clear
         ]
-        if not all(self.shell.contains(area.x0, area.z0, area.x1, area.z1) for area in areas):
+        if not all(self.shell.contains(*block.area) for block in areas) or self._are_in_the_way(solids, rugs, areas):
             return False
-        if self._are_in_the_way(solids, rugs, areas):
-            return False
-        rectangles = [(b.x0, b.z0, b.x1, b.z1) for b in [*self.blocks, *solids] if b.solid]
-        if _walkable_share(self.shell, rectangles) < least_share:
+        standing = [block.area for block in [*self.blocks, *solids] if block.solid]
+        if _walkable_share(self.shell, standing) < least_share:
             return False
         self.placed += stands
         self.blocks += solids + areas
@@ -166,13 +161,13 @@ class FloorPlan:
 
     def is_free(self, stand: Placed, low: float, high: float, margin: float) -> bool:
         """Whether nothing comes closer than a margin to where a piece would hang between two heights, metres."""
-        block = Block(*stand.footprint, low, high)
+        block = Block(stand.footprint, low, high)
         return self.shell.contains(*stand.footprint) and not any(block.meets(other, margin) for other in self.blocks)
 
     def hang(self, stand: Placed, low: float, high: float) -> None:
         """Put something on a wall or ceiling, where it takes no floor."""
         self.placed.append(stand)
-        self.blocks.append(Block(*stand.footprint, low, high, False))
+        self.blocks.append(Block(stand.footprint, low, high, False))
 
 
 def places(start: float, end: float, pitch: float) -> list[float]:
@@ -183,7 +178,7 @@ def places(start: float, end: float, pitch: float) -> list[float]:
 def _before(wall: Wall, rectangle: Rectangle, low: float, high: float, *, solid: bool = False) -> Block:
     """A block before a wall: left, inwards, right, inwards in metres, between two heights."""
     (xa, za), (xb, zb) = wall.point(*rectangle[:2]), wall.point(*rectangle[2:])
-    return Block(min(xa, xb), min(za, zb), max(xa, xb), max(za, zb), low, high, solid)
+    return Block((min(xa, xb), min(za, zb), max(xa, xb), max(za, zb)), low, high, solid)
 
 
 def stand_at(member: Member, wall: Wall, right: float, inwards: float) -> Placed:
