@@ -80,15 +80,10 @@ def broken_link(path: Path) -> str | None:
 
 
 def decode_picture(content: bytes, name: str, mode: str = "RGB") -> NDArray[np.uint8]:
-    """Pixels, `(height, width, 3)` uint8 as stored (sRGB), of an encoded picture; with alpha as a fourth for RGBA.
+    """Pixels, `(height, width, 3)` uint8 as stored (sRGB), of a PNG, JPEG or other picture that Pillow reads.
 
-    Args:
-        content: an encoded PNG, JPEG or other format that Pillow reads.
-        name: what to call the picture in an error.
-        mode: `RGB` or `RGBA`; greys of 16 bits, which have no alpha, have three values in both.
-
-    Raises:
-        SceneError: the bytes are no picture.
+    With the mode `RGBA` alpha is a fourth value, except of greys of 16 bits, which have none. SceneError, which begins
+    with `name`, where the bytes are no picture.
     """
     from PIL import Image
 

@@ -71,7 +71,6 @@ class Layer:
         What counts is the path as it is written: links may lead anywhere.
         """
         target = folder / value
-        # No file system takes the null character, and asking about one is an error of its own.
         if "\0" in value or not Path(os.path.abspath(target)).is_relative_to(os.path.abspath(root)):
             raise self.error(key, f"{value!r} lies outside of {root}, the folder of its data")
         return Path(os.path.normpath(target))

@@ -104,16 +104,10 @@ def panel(
 ) -> MeshSurface:
     """A flat rectangle, subdivided so that light can vary over it; all lengths are in metres.
 
-    Args:
-        corner: upper left corner as seen from the front, from where the edges `right` and `down` lead.
-        right: edge vector.
-        down: edge vector.
-        material: whose picture measures metres along `right` and `down`, from `origin` on.
-        pitch: largest distance between vertices.
-        fit: part of the picture (u0, v0, u1, v1) to stretch over the rectangle instead.
-        turned: let u of the picture run downwards.
-        origin: how far along right and down the picture starts.
-        holes: rectangles (right0, down0, right1, down1) that are left out.
+    `corner` is the upper left one as seen from the front, from where the edges `right` and `down` lead. The picture
+    measures metres along those, from `origin` on (u runs downwards where it is `turned`), or its part `fit` (u0, v0,
+    u1, v1) is stretched over the rectangle. Vertices are at most `pitch` apart; `holes` (right0, down0, right1, down1)
+    are left out.
     """
     start, across, fall = (np.asarray(part, dtype=np.float64) for part in (corner, right, down))
     width, height = float(np.sqrt((across**2).sum())), float(np.sqrt((fall**2).sum()))
@@ -151,8 +145,6 @@ _FACES = {
     "bottom": ((-1, -1, 1), 0, 2, 1, -1),
 }
 """Of each face: its upper left corner, the axes of right and down, and their signs."""
-
-ALL_FACES = tuple(_FACES)
 
 
 def _face_corners(face: str) -> NDArray[np.int64]:
@@ -200,7 +192,7 @@ def box(
     centre: Vector,
     material: Material,
     *,
-    faces: tuple[str, ...] = ALL_FACES,
+    faces: tuple[str, ...] = tuple(_FACES),
     fit: Rectangle | None = None,
     pitch: float = 0.35,
 ) -> list[MeshSurface]:
