@@ -151,16 +151,6 @@ def test_vertex_colours_of_every_type_mean_the_same(tmp_path, stored, normalised
             ["KHR_materials_transmission", "KHR_materials_ior"],
             "transparent materials are shown opaque: pane",
         ),
-        (
-            {
-                "name": "lamp",
-                "pbrMetallicRoughness": {"baseColorTexture": INFO},
-                "emissiveTexture": INFO,
-                "emissiveFactor": [1, 1, 1],
-            },
-            [],
-            "the light that materials emit is not added to their colours: lamp",
-        ),
         ({}, ["EXT_b", "EXT_a"], "extensions that are not supported are ignored: EXT_a, EXT_b"),
         ({"alphaMode": "BLEND"}, ["EXT_a"], "transparent .*material 0; extensions .*EXT_a"),
     ],

@@ -43,7 +43,7 @@ def test_convex_polygons_are_fans_among_others():
     square, triangle = [(0, 0), (1, 0), (1, 1), (0, 1)], [(5, 5), (6, 5), (5, 6)]
     points = np.pad(np.array([*square, *DART, *triangle, *square], float), ((0, 0), (0, 1)))
     places, polygons = triangulate(np.array([4, 4, 3, 4]), np.arange(15), points)
-    assert places.tolist() == [[0, 1, 2], [0, 2, 3], [5, 6, 7], [5, 7, 4], [8, 9, 10], [11, 12, 13], [11, 13, 14]]
+    assert places.tolist() == [[0, 1, 2], [0, 2, 3], [7, 4, 5], [5, 6, 7], [8, 9, 10], [11, 12, 13], [11, 13, 14]]
     assert polygons.tolist() == [0, 0, 1, 1, 2, 3, 3]
 
 

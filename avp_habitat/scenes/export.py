@@ -28,10 +28,6 @@ _LINEAR, _MIPMAPS = 9729, 9987
 def export_glb(mesh: TexturedMesh, path: Path) -> None:
     """Write a mesh as binary glTF 2.0 with unlit materials, embedded PNG textures, `COLOR_0`, and masks as alpha.
 
-    Args:
-        mesh: world frame, metres, Y up (glTF's own axes).
-        path: where to; the file appears there only when it is complete.
-
     Raises:
         UsageError: the name does not end in `.glb`, or the file exists.
         SceneError: the file cannot be written.

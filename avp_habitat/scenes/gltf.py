@@ -12,7 +12,7 @@ import pygltflib
 from numpy.typing import NDArray
 
 from avp_habitat.errors import SceneError
-from avp_habitat.scenes.files import SceneFiles, check_memory, decode_picture
+from avp_habitat.scenes.files import SceneFiles, decode_picture
 from avp_habitat.scenes.gltf_materials import SUPPORTED, GltfSurface, ignored, surface_of
 from avp_habitat.scenes.mesh import TexturedMesh, merge, only, warn_once, with_mask
 
@@ -22,26 +22,17 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _REPEAT = 10497
 _EDGE = 0.01
 """Texture coordinates so little beyond a picture's edge show hardly anything else."""
-_VERTEX_BYTES, _CORNER_BYTES = 160, 30
-"""What reading takes at most for each vertex and each triangle's corner, copies included."""
-# What walking through a document raises where a field is missing, of another type or out of range.
-_MALFORMED = (ArithmeticError, AttributeError, LookupError, MemoryError, OSError, RecursionError, TypeError)
-_MALFORMED += (ValueError, struct.error)
+_EXPECTED = "a valid glTF 2.0 file"
 
 
 def read_gltf(files: SceneFiles) -> TexturedMesh:
     """The triangles of a document's default scene in the world frame; points and lines have no surface.
 
-    Args:
-        files: the `.glb` or `.gltf` file and its folder.
-
     Raises:
         SceneError: the file is damaged, holds no triangle, or requires an extension that is not supported.
     """
-    try:
+    with files.expected(_EXPECTED):
         return _Reader(files).mesh()
-    except _MALFORMED as error:
-        raise _damaged(files, error) from error
 
 
 def shown_as_it_is(files: SceneFiles) -> bool:
@@ -54,119 +45,21 @@ def shown_as_it_is(files: SceneFiles) -> bool:
     Raises:
         SceneError: the file is damaged.
     """
-    try:
+    with files.expected(_EXPECTED):
         document = _parse(files.main)
         surfaces = [surface_of(material) for material in document.materials or []]
         mirrored = any(np.linalg.det(_local_transform(node)[:3, :3]) < 0 for node in document.nodes)
-    except _MALFORMED as error:
-        raise _damaged(files, error) from error
-    foreign = set(document.extensionsRequired or []) - SUPPORTED
+        foreign = set(document.extensionsRequired or []) - SUPPORTED
     return bool(foreign) or (not mirrored and all(surface.cutoff is None and surface.tinted for surface in surfaces))
-
-
-def _damaged(files: SceneFiles, error: Exception) -> SceneError:
-    reason = " ".join(str(error).split()) or type(error).__name__
-    return SceneError(f"{files.path}: expected a valid glTF 2.0 file, but it is damaged: {reason}")
-
-
-class _Buffers:
-    """The accessors and buffer views of one document, each buffer read once."""
-
-    def __init__(self, document: pygltflib.GLTF2, files: SceneFiles) -> None:
-        self._document, self._files = document, files
-        self._content: dict[int, bytes] = {}
-
-    def resolve(self, uri: str) -> bytes:
-        """Bytes of a data URI or of a file in the scene's folder."""
-        if not uri.startswith("data:"):
-            return self._files.read(uri)
-        header, _, payload = uri.partition(",")
-        if not header.endswith(";base64"):
-            raise SceneError(f"{self._files.path}: expected a base64 data URI, got {header[:40]!r}")
-        try:
-            return base64.b64decode(payload, validate=True)
-        except ValueError as error:
-            raise SceneError(f"{self._files.path}: a data URI is damaged: {error}") from error
-
-    def view(self, index: int) -> memoryview:
-        """Bytes of a buffer view."""
-        view = self._document.bufferViews[index]
-        content = self._buffer(view.buffer)
-        start = view.byteOffset or 0
-        if start < 0 or view.byteLength < 0 or start + view.byteLength > len(content):
-            raise SceneError(
-                f"{self._files.path}: truncated: buffer view {index} ends at byte {start + view.byteLength} "
-                f"of a buffer with {len(content)} bytes"
-            )
-        return memoryview(content)[start : start + view.byteLength]
-
-    def array(self, index: int) -> NDArray:
-        """An accessor as `(count, width)`; normalised integers become float32 in [0, 1] or [-1, 1]."""
-        accessor = self._document.accessors[index]
-        if accessor.componentType not in _COMPONENT or accessor.type not in _WIDTH:
-            raise SceneError(
-                f"{self._files.path}: accessor {index} has component type {accessor.componentType} and type "
-                f"{accessor.type}; expected one of {sorted(_COMPONENT)} and one of {', '.join(_WIDTH)}"
-            )
-        dtype, shape = np.dtype(_COMPONENT[accessor.componentType]), (accessor.count, _WIDTH[accessor.type])
-        if accessor.bufferView is not None:
-            values = self._dense(index, dtype, shape)
-        else:
-            # This costs no byte of the file, so that the count may be anything.
-            most = sum(len(self._buffer(buffer)) for buffer in range(len(self._document.buffers)))
-            if shape[0] > most:
-                raise SceneError(
-                    f"{self._files.path}: accessor {index} claims {shape[0]} elements without any data for them, in a "
-                    f"file whose buffers hold {most} bytes"
-                )
-            values = np.zeros(shape, dtype)
-        if accessor.sparse is not None:
-            values = self._with_sparse(accessor.sparse, values.copy())
-        return _fractions(values) if accessor.normalized else values
-
-    def _with_sparse(self, sparse: Any, values: NDArray) -> NDArray:
-        (where, what), count = (sparse.indices, sparse.values), sparse.count
-        rows = np.frombuffer(self.view(where.bufferView), _COMPONENT[where.componentType], count, where.byteOffset or 0)
-        new = np.frombuffer(self.view(what.bufferView), values.dtype, count * values.shape[1], what.byteOffset or 0)
-        values[rows] = new.reshape(count, -1)
-        return values
-
-    def _buffer(self, index: int) -> bytes:
-        if index not in self._content:
-            uri = self._document.buffers[index].uri
-            content = self.resolve(uri) if uri else self._document.binary_blob()
-            if content is None:
-                raise SceneError(f"{self._files.path}: truncated: buffer {index} has neither a uri nor a binary chunk")
-            self._content[index] = content
-        return self._content[index]
-
-    def _dense(self, index: int, dtype: np.dtype, shape: tuple[int, int]) -> NDArray:
-        accessor: Any = self._document.accessors[index]
-        stride = self._document.bufferViews[accessor.bufferView].byteStride or dtype.itemsize * shape[1]
-        data, offset = self.view(accessor.bufferView), accessor.byteOffset or 0
-        end = offset + (shape[0] - 1) * stride + dtype.itemsize * shape[1]
-        if shape[0] < 1 or offset < 0 or end > len(data):
-            raise SceneError(
-                f"{self._files.path}: truncated: accessor {index} needs {shape[0]} elements up to byte {end} "
-                f"of a buffer view with {len(data)} bytes"
-            )
-        return np.ndarray(shape, dtype, data, offset, (stride, dtype.itemsize))
-
-
-def _fractions(values: NDArray) -> NDArray:
-    """Integers as fractions of their type's greatest value (glTF 2.0, section 3.11: -128 and -127 are both -1)."""
-    if values.dtype.kind == "f":
-        return values
-    return np.maximum(values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max), np.float32(-1.0))
 
 
 class _Reader:
     """One document on its way to a mesh."""
 
     def __init__(self, files: SceneFiles) -> None:
-        self._path = files.path
+        self._files, self._path = files, files.path
         self._document = _parse(files.main)
-        self._buffers = _Buffers(self._document, files)
+        self._buffer = cache(self._read_buffer)
         # The same object for the same picture, which is kept once then.
         self._picture, self._mask = cache(self._decode), cache(self._read_mask)
         version = str(self._document.asset.version)
@@ -183,39 +76,67 @@ class _Reader:
         """All triangles of the default scene, placed in the world."""
         if phrases := ignored(self._document):
             warn_once(str(self._path), "; ".join(phrases))
-        placed = list(self._placed())
-        # A small file can name the same vertices again and again.
-        check_memory(f"{self._path}: its mesh", sum(self._bytes_of(primitive) for primitive, _ in placed))
-        parts = [part for each in placed if (part := self._primitive(*each)) is not None]
-        if parts:
-            return merge(parts)
-        raise SceneError(f"{self._path}: expected a mesh with triangles, found none in the default scene")
-
-    def _placed(self) -> Iterator[tuple[pygltflib.Primitive, NDArray]]:
-        """Primitives with their `(4, 4)` transforms to the world, in document order."""
         nodes, scenes = self._document.nodes, self._document.scenes
         if scenes:
             roots = scenes[self._document.scene or 0].nodes or []
         else:
             children = {child for node in nodes for child in node.children or []}
             roots = [index for index in range(len(nodes)) if index not in children]
-        waiting = [(root, np.eye(4)) for root in reversed(roots)]
-        seen: set[int] = set()
-        while waiting:
-            index, parent = waiting.pop()
-            if index in seen:
-                raise SceneError(f"{self._path}: node {index} has two parents; expected a tree of nodes")
-            seen.add(index)
-            to_world = parent @ _local_transform(nodes[index])
-            if (mesh := nodes[index].mesh) is not None:
-                yield from ((primitive, to_world) for primitive in self._document.meshes[mesh].primitives)
-            waiting += [(child, to_world) for child in reversed(nodes[index].children or [])]
+        placed = [each for root in roots for each in self._placed(root, np.eye(4))]
+        parts = [part for each in placed if (part := self._primitive(*each)) is not None]
+        if parts:
+            return merge(parts)
+        raise SceneError(f"{self._path}: expected a mesh with triangles, found none in the default scene")
 
-    def _bytes_of(self, primitive: pygltflib.Primitive) -> int:
-        position = primitive.attributes.POSITION
-        vertices = 0 if position is None else self._document.accessors[position].count
-        corners = vertices if primitive.indices is None else self._document.accessors[primitive.indices].count
-        return _VERTEX_BYTES * vertices + _CORNER_BYTES * corners
+    def _placed(self, index: int, parent: NDArray) -> Iterator[tuple[pygltflib.Primitive, NDArray]]:
+        """Primitives of a node and those below it with their `(4, 4)` transforms to the world, in document order."""
+        node = self._document.nodes[index]
+        to_world = parent @ _local_transform(node)
+        if node.mesh is not None:
+            yield from ((primitive, to_world) for primitive in self._document.meshes[node.mesh].primitives)
+        for child in node.children or []:
+            yield from self._placed(child, to_world)
+
+    def _resolve(self, uri: str) -> bytes:
+        """Bytes of a data URI or of a file in the scene's folder."""
+        if uri.startswith("data:"):
+            return base64.b64decode(uri.partition(",")[2], validate=True)
+        return self._files.read(uri)
+
+    def _read_buffer(self, index: int) -> bytes:
+        uri = self._document.buffers[index].uri
+        content = self._resolve(uri) if uri else self._document.binary_blob()
+        if content is None:
+            raise ValueError(f"truncated: buffer {index} has neither a uri nor a binary chunk")
+        return content
+
+    def _view(self, index: int) -> memoryview:
+        """Bytes of a buffer view."""
+        view = self._document.bufferViews[index]
+        content, start = self._buffer(view.buffer), view.byteOffset or 0
+        end = start + view.byteLength
+        if end > len(content):
+            raise ValueError(f"truncated: buffer view {index} ends at byte {end} of a buffer with {len(content)} bytes")
+        return memoryview(content)[start:end]
+
+    def _array(self, index: int) -> NDArray:
+        """An accessor as `(count, width)`; normalised integers become float32 in [0, 1] or [-1, 1]."""
+        accessor: Any = self._document.accessors[index]
+        dtype, shape = np.dtype(_COMPONENT[accessor.componentType]), (accessor.count, _WIDTH[accessor.type])
+        if accessor.bufferView is None:
+            values = np.zeros(shape, dtype)
+        else:
+            stride = self._document.bufferViews[accessor.bufferView].byteStride or dtype.itemsize * shape[1]
+            data, start = self._view(accessor.bufferView), accessor.byteOffset or 0
+            values = np.ndarray(shape, dtype, data, start, (stride, dtype.itemsize))
+        if accessor.sparse is not None:
+            (where, what), count = (accessor.sparse.indices, accessor.sparse.values), accessor.sparse.count
+            codes, places = _COMPONENT[where.componentType], self._view(where.bufferView)
+            rows = np.frombuffer(places, codes, count, where.byteOffset or 0)
+            new = np.frombuffer(self._view(what.bufferView), dtype, count * shape[1], what.byteOffset or 0)
+            values = values.copy()
+            values[rows] = new.reshape(count, -1)
+        return _fractions(values) if accessor.normalized else values
 
     def _primitive(self, primitive: pygltflib.Primitive, to_world: NDArray) -> TexturedMesh | None:
         mode = _TRIANGLES if primitive.mode is None else primitive.mode
@@ -225,7 +146,7 @@ class _Reader:
         has_data = self._document.accessors[attributes.POSITION].bufferView is not None
         if "KHR_draco_mesh_compression" in (primitive.extensions or {}) and not has_data:
             raise SceneError(f"{self._path}: uses KHR_draco_mesh_compression, which is not supported")
-        local = self._buffers.array(attributes.POSITION).astype(np.float64)
+        local = self._array(attributes.POSITION).astype(np.float64)
         vertices = local @ to_world[:3, :3].T + to_world[:3, 3]
         triangles = self._triangles(primitive.indices, mode, len(vertices))
         if np.linalg.det(to_world[:3, :3]) < 0:
@@ -256,10 +177,10 @@ class _Reader:
 
     def _triangles(self, accessor: int | None, mode: int, vertices: int) -> NDArray[np.int32]:
         """`(t, 3)` vertex indices of a list, strip or fan."""
-        corners = np.arange(vertices) if accessor is None else self._buffers.array(accessor).reshape(-1)
+        corners = np.arange(vertices) if accessor is None else self._array(accessor).reshape(-1)
         corners = corners.astype(np.int64)
         if len(corners) and corners.max() >= vertices:
-            raise SceneError(f"{self._path}: a triangle names vertex {corners.max()} of {vertices}")
+            raise ValueError(f"a triangle names vertex {corners.max()} of {vertices}")
         if mode == _TRIANGLES:
             return corners[: len(corners) // 3 * 3].reshape(-1, 3).astype(np.int32)
         first = corners[:-2] if mode == _STRIP else np.broadcast_to(corners[:1], max(len(corners) - 2, 0))
@@ -292,11 +213,9 @@ class _Reader:
         return np.clip(colours, 0, 1).astype(np.float32)
 
     def _matching(self, accessor: int, name: str, vertices: int) -> NDArray:
-        values = self._buffers.array(accessor)
+        values = self._array(accessor)
         if len(values) != vertices:
-            raise SceneError(
-                f"{self._path}: expected {vertices} values of {name}, one for each vertex; got {len(values)}"
-            )
+            raise ValueError(f"expected {vertices} values of {name}, one for each vertex; got {len(values)}")
         return values
 
     def _image(self, texture: int) -> int:
@@ -309,13 +228,20 @@ class _Reader:
 
     def _decode(self, index: int, mode: str = "RGB") -> NDArray[np.uint8]:
         image = self._document.images[index]
-        content = self._buffers.resolve(image.uri) if image.uri else bytes(self._buffers.view(image.bufferView))
+        content = self._resolve(image.uri) if image.uri else bytes(self._view(image.bufferView))
         return decode_picture(content, f"{self._path}: image {index}", mode)
 
     def _read_mask(self, index: int, least: float) -> NDArray[np.bool_]:
         """`(height, width)` where a picture's alpha is at least so much."""
         alpha = self._decode(index, "RGBA")[..., 3:]
         return (alpha >= 255 * least)[..., 0] if alpha.size else np.ones(alpha.shape[:2], bool)
+
+
+def _fractions(values: NDArray) -> NDArray:
+    """Integers as fractions of their type's greatest value (glTF 2.0, section 3.11: -128 and -127 are both -1)."""
+    if values.dtype.kind == "f":
+        return values
+    return np.maximum(values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max), np.float32(-1.0))
 
 
 def _parse(content: bytes) -> pygltflib.GLTF2:

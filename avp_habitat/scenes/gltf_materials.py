@@ -6,7 +6,7 @@ What has alphaMode BLEND it draws opaque, and so does the suite; what MASK cuts 
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,9 +27,9 @@ SUPPORTED = {
     *(f"KHR_materials_{name}" for name in ("sheen", "specular", "volume")),
 }
 """Extensions that a document may require."""
-# Without these, a document that does not require them is shown by what it holds for the purpose; else it is refused.
+# A document that does not require these is shown by what it holds for the purpose; else it is refused.
 _REPLACED = {"EXT_meshopt_compression", "KHR_draco_mesh_compression", "KHR_texture_basisu", "MSFT_texture_dds"}
-_TRANSMISSION = ("KHR_materials_transmission", "KHR_materials_diffuse_transmission")
+_TRANSMISSION = {"KHR_materials_transmission", "KHR_materials_diffuse_transmission"}
 _NAMED = 4
 
 
@@ -41,7 +41,7 @@ class GltfSurface:
     """`(4,)` colour and alpha that multiply the picture."""
     texture: int | None = None
     coordinates: str = "TEXCOORD_0"
-    """Name of the attribute that holds the texture coordinates."""
+    """The attribute with the texture coordinates."""
     transform: NDArray[np.float32] | None = None
     """`(2, 3)` affine map of the texture coordinates, None to leave them."""
     cutoff: float | None = None
@@ -77,32 +77,17 @@ def surface_of(material: pygltflib.Material | None) -> GltfSurface:
 
 def ignored(document: pygltflib.GLTF2) -> list[str]:
     """What of a document is not shown as it is meant, a phrase each."""
-    materials = document.materials or []
-    unknown = sorted(set(document.extensionsUsed or []) - SUPPORTED - _REPLACED - set(_TRANSMISSION))
+    clear = [
+        material.name or f"material {number}"
+        for number, material in enumerate(document.materials or [])
+        if material.alphaMode == "BLEND" or not _TRANSMISSION.isdisjoint(material.extensions or {})
+    ]
+    unknown = sorted(set(document.extensionsUsed or []) - SUPPORTED - _REPLACED - _TRANSMISSION)
     found = {
-        "transparent materials are shown opaque": _names(materials, _is_clear),
-        "the light that materials emit is not added to their colours": _names(materials, _adds_light),
-        "extensions that are not supported are ignored": ", ".join(unknown),
+        "transparent materials are shown opaque": clear[:_NAMED] + ["…"] * (len(clear) > _NAMED),
+        "extensions that are not supported are ignored": unknown,
     }
-    return [f"{what}: {names}" for what, names in found.items() if names]
-
-
-def _is_clear(material: pygltflib.Material) -> bool:
-    return material.alphaMode == "BLEND" or any(name in (material.extensions or {}) for name in _TRANSMISSION)
-
-
-def _adds_light(material: pygltflib.Material) -> bool:
-    """Whether a material has an emissive picture besides the one that is shown."""
-    unlit = "KHR_materials_unlit" in (material.extensions or {})
-    lit = material.emissiveTexture is not None and bool(_light(material).any())
-    return lit and not unlit and surface_of(material).tinted
-
-
-def _names(materials: list[pygltflib.Material], test: Callable[[pygltflib.Material], bool]) -> str:
-    """The first of the materials that pass, by name or number; empty where none does."""
-    names = [each.name or f"material {number}" for number, each in enumerate(materials) if test(each)]
-    more = len(names) - _NAMED
-    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+    return [f"{what}: {', '.join(names)}" for what, names in found.items() if names]
 
 
 def _light(material: pygltflib.Material) -> NDArray[np.float32]:

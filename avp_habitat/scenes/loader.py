@@ -42,8 +42,7 @@ def load_scene(spec: str | Path, *, up: str | None = None, origin: Sequence[floa
     """Load a scene.
 
     Args:
-        spec: a mesh (metres), a scene of Replica or of a scene dataset config, or `builtin:SEED` for a generated room;
-            `avp_habitat.scenes.location.locate` says what can be written.
+        spec: what `avp_habitat.scenes.location.locate` takes; meshes are in metres.
         up: axis of a mesh file that points up, `y` or `z`.
         origin: `(3,)` taken off the file's coordinates, turned to Y up, as a rollout of the scene says it; chosen here
             when omitted.
@@ -72,14 +71,11 @@ def load_located(location: SceneLocation, *, origin: Sequence[float] | None = No
 
 
 def identify(location: SceneLocation) -> tuple[str, Frame]:
-    """Digest and frame of a scene, the same as those of the loaded scene.
+    """Digest and frame of a scene, the same as those of the loaded scene; SceneError where the mesh cannot be read.
 
     The digest is the hexadecimal SHA-256 of what the scene is made of: of the mesh and the files that it refers to;
     where a scene has configs or axes other than Y up, -Z front, of those too (of objects, the config that names them);
     of a generated room of the seed and the generator's version.
-
-    Raises:
-        SceneError: the mesh is damaged, or holds no triangle.
     """
     if location.asset is None:
         from avp_habitat.scenes.builtin.room import GENERATOR_VERSION
@@ -107,6 +103,7 @@ def _digest(location: SceneLocation, files: SceneFiles) -> str:
 
 
 def _read(files: SceneFiles) -> TexturedMesh:
+    """The mesh of a file, refused where a renderer could not use it: without triangles, or with NaN or infinities."""
     suffix = files.path.suffix.lower()
     if suffix == ".ply":
         mesh = read_ply(files)
@@ -116,43 +113,39 @@ def _read(files: SceneFiles) -> TexturedMesh:
         from avp_habitat.scenes.gltf import read_gltf
 
         mesh = read_gltf(files)
-    _check_numbers(mesh, files.path)
+    if not len(mesh.triangles):
+        raise SceneError(f"{files.path}: expected a mesh with triangles, found none")
+    for name, values in (("position", mesh.vertices), ("texture coordinate", mesh.uv), ("colour", mesh.colours)):
+        wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if len(wrong):
+            raise SceneError(
+                f"{files.path}: expected finite numbers, but {len(wrong)} of {len(values)} vertices have a {name} that "
+                f"is NaN or infinite (the first is vertex {wrong[0]})"
+            )
     return mesh
 
 
 def _placed(
     mesh: TexturedMesh, location: SceneLocation, origin: Sequence[float] | None = None
 ) -> tuple[TexturedMesh, Frame]:
-    """The mesh in the world, and what has to be said of how it lies there."""
-    asset = str(location.asset)
-    lost = 0.0 if asset.lower().endswith(".obj") else _float32_step_mm(mesh)
-    mesh, moved = _place(mesh, (location.up, location.front), origin, asset)
+    """The mesh in the world, after what has to be said of how it lies there."""
+    asset, axes = str(location.asset), (location.up, location.front)
+    lost_mm = 0.0 if asset.lower().endswith(".obj") else _float32_step_mm(mesh)
+    mesh, moved = _moved(mesh, axes, origin, asset)
     if any(moved):
         far = f"{max(map(abs, moved)):.0f} m"
-        if lost >= _MOST_LOST_MM:
+        if lost_mm >= _MOST_LOST_MM:
             raise SceneError(
-                f"{asset}: has coordinates of {far} in float32, which has steps of {lost:.0f} mm there: "
+                f"{asset}: has coordinates of {far} in float32, which has steps of {lost_mm:.0f} mm there: "
                 "expected a mesh that was exported near its origin"
             )
         text = f"lies {far} from its origin: ({', '.join(f'{each:.0f}' for each in moved)}) m are taken off"
-        warn_once(asset, text + (f"; as float32, its coordinates are rounded to {lost:.0f} mm" if lost >= 1 else ""))
-    if (location.up, location.front) == Y_UP and location.chosen_up is None and looks_z_up(mesh):
+        rounded = f"; as float32, its coordinates are rounded to {lost_mm:.0f} mm" if lost_mm >= 1 else ""
+        warn_once(asset, text + rounded)
+    if axes == Y_UP and location.chosen_up is None and looks_z_up(mesh):
         own = f'"up": [0, 0, 1], "front": [0, 1, 0] in {location.files[-1].name}' if location.files else "--up z"
         warn_once(asset, f"is taken as Y-up, but looks like a Z-up room on its side; if it is one, say {own}")
     return mesh, Frame(moved, location.chosen_up)
-
-
-def _check_numbers(mesh: TexturedMesh, path: Path) -> None:
-    """Refuse what a renderer could not use: no triangle, or a number that is NaN or infinite."""
-    if not len(mesh.triangles):
-        raise SceneError(f"{path}: expected a mesh with triangles, found none")
-    for name, values in (("position", mesh.vertices), ("texture coordinate", mesh.uv), ("colour", mesh.colours)):
-        wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
-        if len(wrong):
-            raise SceneError(
-                f"{path}: expected finite numbers, but {len(wrong)} of {len(values)} vertices have a {name} that "
-                f"is NaN or infinite (the first is vertex {wrong[0]})"
-            )
 
 
 def _float32_step_mm(mesh: TexturedMesh) -> float:
@@ -163,7 +156,7 @@ def _float32_step_mm(mesh: TexturedMesh) -> float:
     return 1000 * float(np.spacing(np.float32(largest)))
 
 
-def _place(
+def _moved(
     mesh: TexturedMesh, axes: Axes, origin: Sequence[float] | None, name: str
 ) -> tuple[TexturedMesh, tuple[float, float, float]]:
     """Turn a mesh to the world's axes and take a local origin off, in float64, before it is cut to float32.
@@ -176,6 +169,7 @@ def _place(
         # Written out, because BLAS may add in another order on other machines.
         x, y, z = vertices.T
         vertices = np.stack([row[0] * x + row[1] * y + row[2] * z for row in axes_to_world(*axes)], axis=1)
+    # What no triangle uses may lie anywhere.
     used = np.zeros(len(vertices), bool)
     used[mesh.triangles] = True
     low, high = vertices[used].min(axis=0), vertices[used].max(axis=0)
@@ -183,13 +177,12 @@ def _place(
         far = (low > _FAR_M) | (high < -_FAR_M)
         origin = np.where(far, np.round(low / 2 + high / 2), 0.0).tolist()
     shift = np.asarray(origin, np.float64)
-    largest = np.abs(np.stack([low - shift, high - shift])).max()
+    largest = np.abs([low - shift, high - shift]).max()
     if largest > _LARGEST_M:
         raise SceneError(
             f"{name}: has coordinates of {largest:.3g} m, where float32 cannot hold millimetres: expected a room in "
             "metres, at most 1000 km wide"
         )
-    # What no triangle uses may lie anywhere.
     moved = np.clip(vertices - shift, -_LARGEST_M, _LARGEST_M).astype(np.float32)
     return replace(mesh, vertices=moved), (float(shift[0]), float(shift[1]), float(shift[2]))
 
@@ -197,12 +190,10 @@ def _place(
 def looks_z_up(mesh: TexturedMesh) -> bool:
     """Whether a mesh that is taken as Y-up looks like a room with Z up that lies on its side.
 
-    All of these hold: along Z it is as high as a storey, and along Y clearly larger than that and than a storey; the
-    two largest level planes (floor and ceiling, which nothing breaks up as windows and doors do walls) are those
-    across Z; what is not a large plane, the furniture, keeps to the lower end of Z, and more so than to that of Y; and
-    what is level across Y is not spread evenly as the steps of a stairwell are. The shares are those that part 31
-    generated rooms, two scanned ones and a box room, laid on their sides, from 500 corridors, stairwells, attics and
-    lofts that stand upright.
+    All of these hold: along Z it is as high as a storey, and along Y clearly larger; the two largest level planes
+    (floor and ceiling) are those across Z; the furniture, which is no large plane, keeps to the lower end of Z, and
+    more so than to that of Y; and what is level across Y is not spread evenly, as steps are. The shares part 31
+    generated, two scanned and a box room, laid on their sides, from 500 corridors, stairwells, attics and lofts.
     """
     triangles = mesh.triangles[:: max(1, len(mesh.triangles) // _MOST_LOOKED_AT)]
     corners = mesh.vertices[triangles].astype(np.float64)

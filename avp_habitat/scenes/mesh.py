@@ -22,12 +22,7 @@ _log = logging.getLogger(__name__)
 
 @cache
 def warn_once(scene: str, text: str) -> None:
-    """Log a warning about a scene, one line that Python shows on stderr, once in a process.
-
-    Args:
-        scene: the path as the user wrote it.
-        text: what was found, and what is done with it.
-    """
+    """Log a warning about a scene, named by the path as the user wrote it, once in a process."""
     _log.warning("%s: %s", scene, text)
 
 
@@ -59,11 +54,8 @@ class TexturedMesh:
     def __post_init__(self) -> None:
         """Check the shapes, which are the contract between loaders and renderers."""
         vertices, triangles = len(self.vertices), len(self.triangles)
-        assert self.vertices.shape == (vertices, 3), self.vertices.shape
-        assert self.triangles.shape == (triangles, 3), self.triangles.shape
-        assert self.uv.shape == (vertices, 2), self.uv.shape
-        assert self.colours.shape == (vertices, 3), self.colours.shape
-        assert self.texture_index.shape == (triangles,), self.texture_index.shape
+        found = [each.shape for each in (self.vertices, self.triangles, self.uv, self.colours, self.texture_index)]
+        assert found == [(vertices, 3), (triangles, 3), (vertices, 2), (vertices, 3), (triangles,)], found
 
     @property
     def bounds(self) -> NDArray[np.floating]:
@@ -73,13 +65,13 @@ class TexturedMesh:
 
 def merge(parts: list[TexturedMesh]) -> TexturedMesh:
     """One mesh of several; textures and masks that are the same object are kept once."""
-    offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
+    offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]], dtype=np.int32)
     textures, lookups = _kept_once([part.textures for part in parts])
     masks, mask_lookups = _kept_once([part.masks for part in parts])
     without = [np.full(len(part.triangles), -1) if part.mask_index is None else part.mask_index for part in parts]
     return TexturedMesh(
         np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.triangles + np.int32(at) for part, at in zip(parts, offsets[:-1], strict=True)]),
+        np.concatenate([part.triangles + at for part, at in zip(parts, offsets, strict=True)]),
         np.concatenate([part.uv for part in parts]),
         np.concatenate([part.colours for part in parts]),
         np.concatenate([lookup[part.texture_index] for part, lookup in zip(parts, lookups, strict=True)]),
@@ -129,12 +121,10 @@ def _least_and_most(mask: NDArray[np.bool_], uv: NDArray[np.float32]) -> tuple[N
 
 
 def is_hole(mesh: TexturedMesh, triangles: NDArray[np.integer], at: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Whether points of triangles lie in holes; the texel that they lie in decides.
+    """Whether points lie in holes of a mesh with masks; the texel that they lie in decides.
 
-    Args:
-        mesh: with masks.
-        triangles: `(n,)` indices; those that the mesh does not have are no holes.
-        at: `(n, 2)` barycentric coordinates, shares of the second and third corner.
+    Points have `(n,)` triangles, of which those that the mesh does not have are no holes, and `(n, 2)` shares of the
+    second and third corner.
     """
     assert mesh.mask_index is not None
     result = np.zeros(len(triangles), bool)
@@ -143,9 +133,8 @@ def is_hole(mesh: TexturedMesh, triangles: NDArray[np.integer], at: NDArray[np.f
     for number in np.unique(index[index >= 0]):
         rays = valid[index == number]
         mask = mesh.masks[number]
-        a, b, c = np.moveaxis(mesh.uv[mesh.triangles[triangles[rays]]].astype(np.float64), 1, 0)
-        u, v = at[rays, :1], at[rays, 1:]
-        texel = np.floor((a + u * (b - a) + v * (c - a)) * mask.shape[::-1]).astype(np.int64) % mask.shape[::-1]
+        uv = _between(mesh.uv[mesh.triangles[triangles[rays]]], at[rays])
+        texel = np.floor(uv * mask.shape[::-1]).astype(np.int64) % mask.shape[::-1]
         result[rays] = ~mask[texel[:, 1], texel[:, 0]]
     return result
 
@@ -153,9 +142,7 @@ def is_hole(mesh: TexturedMesh, triangles: NDArray[np.integer], at: NDArray[np.f
 def without_holes(mesh: TexturedMesh, size_m: float) -> TexturedMesh:
     """The surfaces alone, for who does not look at pictures: of masked triangles the pieces that are there.
 
-    Args:
-        mesh: metres.
-        size_m: how long the pieces' edges are at most (longer ones where there would be millions).
+    The pieces' edges are at most `size_m` metres long (longer where there would be millions of pieces).
     """
     if mesh.mask_index is None:
         return mesh
@@ -165,7 +152,8 @@ def without_holes(mesh: TexturedMesh, size_m: float) -> TexturedMesh:
     pieces = np.tile(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), (len(masked), 1, 1))
     owner, done = masked, []
     while len(owner):
-        points = _points(mesh, owner, pieces)
+        corners = mesh.vertices[mesh.triangles[owner]]
+        points = np.stack([_between(corners, pieces[:, corner]) for corner in range(3)], axis=1)
         longest = np.sqrt(((points - np.roll(points, 1, axis=1)) ** 2).sum(axis=2)).max(axis=1)
         small = (longest <= size_m) | (4 * len(owner) > _MOST_PIECES)
         there = small & ~is_hole(mesh, owner, pieces.mean(axis=1))
@@ -178,10 +166,10 @@ def without_holes(mesh: TexturedMesh, size_m: float) -> TexturedMesh:
     return merge([replace(whole, mask_index=None, masks=[]), there])
 
 
-def _points(mesh: TexturedMesh, owner: NDArray, pieces: NDArray) -> NDArray:
-    """`(n, 3, 3)` corners in metres of `(n, 3, 2)` pieces of triangles."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles[owner]].astype(np.float64), 1, 0)
-    return a[:, None] + pieces[..., :1] * (b - a)[:, None] + pieces[..., 1:] * (c - a)[:, None]
+def _between(corners: NDArray, at: NDArray) -> NDArray:
+    """`(n, k)` values at `(n, 2)` barycentric coordinates of triangles with `(n, 3, k)` values at their corners."""
+    a, b, c = np.moveaxis(corners.astype(np.float64), 1, 0)
+    return a + at[:, :1] * (b - a) + at[:, 1:] * (c - a)
 
 
 def _in_four(pieces: NDArray) -> NDArray:
@@ -203,7 +191,7 @@ def triangulate(
         positions: `(v, 3)` of the vertices.
 
     Returns:
-        `(t, 3)` places of the triangles' corners in the list of all corners, and `(t,)` the polygons they are of.
+        `(t, 3)` places in the list of all corners, and `(t,)` the polygons that the triangles are of.
 
     Raises:
         ValueError: a polygon that is not convex has so many corners that to cut it would take minutes.
@@ -215,13 +203,8 @@ def triangulate(
     first = start[polygons]
     step = np.arange(len(polygons)) - begin[polygons]
     places = np.stack([first, first + step + 1, first + step + 2], axis=1)
-    for some in _portions(np.flatnonzero(lengths == 4)):
-        at = start[some]
-        turned = some[_is_bent(*(positions[corners[at + step]].astype(np.float64) for step in range(4)))]
-        # The other diagonal.
-        places[begin[turned]] = start[turned, None] + [1, 2, 3]
-        places[begin[turned] + 1] = start[turned, None] + [1, 3, 0]
-    for some in _portions(np.flatnonzero(lengths > 4)):
+    large = np.flatnonzero(lengths > 3)
+    for some in np.array_split(large, len(large) // _AT_ONCE + 1):
         for polygon, points, normal in _not_convex(some, lengths[some], start[some], corners, positions):
             if len(points) > _MOST_CORNERS:
                 raise ValueError(
@@ -230,19 +213,6 @@ def triangulate(
                 )
             places[begin[polygon] :][: len(points) - 2] = start[polygon] + _ears(points, normal)
     return places, polygons
-
-
-def _portions(indices: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    return np.array_split(indices, len(indices) // _AT_ONCE + 1)
-
-
-def _is_bent(a: NDArray, b: NDArray, c: NDArray, d: NDArray) -> NDArray[np.bool_]:
-    """`(n,)` whether the diagonal from a to c lies outside of a quad: its halves face different ways."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        one, two = np.cross(b - a, c - a), np.cross(c - a, d - a)
-        whole = one + two
-        least = np.minimum((one * whole).sum(axis=1), (two * whole).sum(axis=1))
-        return least < -_STRAIGHT * (whole * whole).sum(axis=1)
 
 
 def _not_convex(

@@ -10,8 +10,6 @@ from avp_habitat.errors import SceneError
 from avp_habitat.scenes.files import SceneFiles, decode_picture
 from avp_habitat.scenes.mesh import TexturedMesh, triangulate, warn_once
 
-_MOST = 2**31 - 1
-"""What an index of 32 bits can hold."""
 _NUMBER = r"(?:\s*(?<!\S)[-+]?[\d.]+(?:e[-+]?\d+)?(?!\S))"
 _OPTION = re.compile(rf"(-mm)\s+({_NUMBER}{{0,2}}+)\s*|(-[ost])\s+({_NUMBER}{{0,3}}+)\s*|(-\S+)\s*(\S*)\s*", re.I)
 """An option of a texture: up to two or three numbers follow some, one word any other."""
@@ -40,7 +38,8 @@ class _Material:
         """Follow one line of a library; ValueError where it cannot be right."""
         key = word.lower()
         if key == "kd":
-            self._take_diffuse(rest)
+            red, *others = (float(part) for part in rest.split()[:3])
+            self.diffuse = (red, *others) if others else (red, red, red)
         elif key == "map_kd":
             self._take_texture(rest.strip())
         elif key in _LOST:
@@ -49,16 +48,6 @@ class _Material:
             numbers = [float(each) for each in re.findall(_NUMBER, rest, re.I)]
             if any(number < 1 if key == "d" else number > 0 for number in numbers):
                 self.unread.append(f"{word} {rest}")
-
-    def _take_diffuse(self, rest: str) -> None:
-        words = rest.split()
-        if words and words[0] in ("spectral", "xyz"):
-            self.unread.append(f"Kd {words[0]}")
-            return
-        numbers = tuple(float(word) for word in words[:3])
-        if len(numbers) not in (1, 3):
-            raise ValueError(f"expected one number or three, got {len(numbers)}")
-        self.diffuse = numbers * (3 // len(numbers))
 
     def _take_texture(self, rest: str) -> None:
         """Options, then the file's name, which may hold spaces."""
@@ -81,15 +70,13 @@ def read_obj(files: SceneFiles) -> TexturedMesh:
 
     Colours are texture × `Kd` × vertex colour (`v x y z r g b`).
 
-    Args:
-        files: the file and its folder.
-
     Raises:
         SceneError: the file is damaged, holds no face, or refers to a file that is missing or outside its folder.
     """
     reader = _Reader(files)
     _read_lines(str(files.path), files.main, reader.take)
-    return reader.mesh()
+    with files.expected("a valid .obj file"):
+        return reader.mesh()
 
 
 def _read_lines(name: str, content: bytes, take: Callable[[str, str], None]) -> None:
@@ -122,26 +109,29 @@ class _Reader:
         self._names: dict[str | None, int] = {None: 0}
         self._material = 0
         self._library: dict[str, _Material] = {}
-        self._takes = {"v": self._vertex, "vt": self._coordinate, "f": self._face, "usemtl": self._use}
-        self._takes["mtllib"] = self._read_library
 
     def take(self, word: str, rest: str) -> None:
         """Read one line; what is not known has no surface. ValueError where it cannot be right."""
-        if word in self._takes:
-            self._takes[word](rest)
+        if word == "v":
+            self._vertex(rest)
+        elif word == "vt":
+            self._coordinates.append([*map(float, _words(rest)[:2]), 0.0, 0.0][:2])
+        elif word == "f":
+            self._face(rest)
+        elif word == "usemtl":
+            self._material = self._names.setdefault(rest, len(self._names))
+        elif word == "mtllib":
+            self._read_library(rest)
 
     def mesh(self) -> TexturedMesh:
         """All faces; SceneError where there are none, or one names a vertex that is not there."""
         corners = np.array(self._corners, np.int64).reshape(-1, 2)
         for column, (kind, count) in enumerate((("v", len(self._positions)), ("vt", len(self._coordinates)))):
             if corners[:, column].max(initial=-1) >= count:
-                raise SceneError(f"{self._files.path}: a face names {kind} {corners[:, column].max() + 1} of {count}")
+                raise ValueError(f"a face names {kind} {corners[:, column].max() + 1} of {count}")
         positions = np.array(self._positions, np.float64).reshape(-1, 3)
         lengths, of_face = np.array(self._faces, np.int64).reshape(-1, 2).T
-        try:
-            places, polygons = triangulate(lengths, corners[:, 0], positions)
-        except ValueError as error:
-            raise SceneError(f"{self._files.path}: {error}") from None
+        places, polygons = triangulate(lengths, corners[:, 0], positions)
         if not len(places):
             raise SceneError(f"{self._files.path}: expected a mesh with triangles, found none")
         material = of_face[polygons]
@@ -177,9 +167,6 @@ class _Reader:
         self._positions.append(numbers[:3])
         self._light.append(numbers[3:6] if len(numbers) >= 6 else [1.0, 1.0, 1.0])
 
-    def _coordinate(self, rest: str) -> None:
-        self._coordinates.append([*map(float, _words(rest)[:2]), 0.0, 0.0][:2])
-
     def _face(self, rest: str) -> None:
         """Corners `v`, `v/vt`, `v//vn` or `v/vt/vn`."""
         words = _words(rest)
@@ -188,9 +175,6 @@ class _Reader:
             of_vertex = _index(vertex, len(self._positions))
             self._corners.append((of_vertex, _index(coordinate, len(self._coordinates)) if coordinate else -1))
         self._faces.append((len(words), self._material))
-
-    def _use(self, rest: str) -> None:
-        self._material = self._names.setdefault(rest, len(self._names))
 
     def _read_library(self, rest: str) -> None:
         """A name with spaces, or several names."""
@@ -229,8 +213,6 @@ def _index(text: str, count: int) -> int:
     """From 0; negative numbers count back from the newest one of `count` so far."""
     number = int(text)
     index = number - 1 if number > 0 else count + number
-    if number > _MOST:
-        raise ValueError(f"a face names {number}; expected {_MOST} at most")
     if number == 0 or index < 0:
         raise ValueError(f"{number} is none of the {count} before it; expected 1, 2, … or -1, -2, …")
     return index

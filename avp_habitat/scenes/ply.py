@@ -7,7 +7,7 @@ a number of values of its own in each row (G. Turk, The PLY Polygon File Format)
 import re
 import struct
 import warnings
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +25,9 @@ _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_
 _COORDINATES = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 _COLOUR_LIKE = re.compile(r"red|rgb|colou?r|f_dc|intensity|material_ind", re.IGNORECASE)
 """Names of properties that may mean a colour."""
-_MALFORMED = (ArithmeticError, LookupError, TypeError, ValueError, struct.error)
 
 
-@dataclass(frozen=True)
-class _Property:
+class _Property(NamedTuple):
     """How values lie in the body, where a text's numbers are float64; a single value has no type of a count."""
 
     name: str
@@ -38,15 +36,13 @@ class _Property:
     integer: bool
 
 
-@dataclass(frozen=True)
-class _Element:
+class _Element(NamedTuple):
     name: str
     rows: int
     properties: list[_Property]
 
 
-@dataclass(frozen=True)
-class _Column:
+class _Column(NamedTuple):
     """The values of a property, row after row, and `(rows,)` how many of them each row has."""
 
     values: NDArray
@@ -62,18 +58,11 @@ def read_ply(files: SceneFiles) -> TexturedMesh:
 
     Colours are those of vertices, else those of faces; a texture is named by a comment `TextureFile NAME`.
 
-    Args:
-        files: the file and its folder.
-
     Raises:
         SceneError: the file is damaged, holds no face, or refers to a file that is missing or outside its folder.
     """
-    try:
-        tables, pictures = _tables(files.main)
-        return _mesh(files, tables, pictures)
-    except _MALFORMED as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise SceneError(f"{files.path}: expected a valid .ply file, but it is damaged: {reason}") from error
+    with files.expected("a valid .ply file"):
+        return _mesh(files, *_tables(files.main))
 
 
 def _tables(content: bytes) -> tuple[dict[str, _Columns], list[str]]:
@@ -85,16 +74,15 @@ def _tables(content: bytes) -> tuple[dict[str, _Columns], list[str]]:
         raise ValueError("truncated: expected a header that ends with end_header")
     lines = content[: end.start()].decode("utf-8", "replace").splitlines()
     order, elements = _header([line.split() for line in lines[1:] if line.strip()])
-    body = content[end.end() :]
-    numbers = _numbers(body) if order == "=" else body
+    text, body = order == "=", content[end.end() :]
+    body = _numbers(body) if text else body
     at, tables = 0, {}
     for element in elements:
-        tables[element.name], at = _read(element, numbers, at)
-    if order == "=":
-        _check_lines(elements, tables, body)
-    return tables, [
-        found[1].strip() for line in lines if (found := re.match(r"(?i)comment\s+TextureFile\s+(.+)", line))
-    ]
+        tables[element.name], at = _read(element, body, at)
+    if text and at < len(body):
+        raise ValueError(f"{(len(body) - at) // 8} numbers are left over after the last row of {elements[-1].name}")
+    textures = (re.match(r"(?i)comment\s+TextureFile\s+(.+)", line) for line in lines)
+    return tables, [found[1].strip() for found in textures if found]
 
 
 def _header(lines: list[list[str]]) -> tuple[str, list[_Element]]:
@@ -129,39 +117,16 @@ def _numbers(text: bytes) -> bytes:
             raise ValueError("expected numbers after the header, got something else") from None
 
 
-def _check_lines(elements: list[_Element], tables: dict[str, _Columns], text: bytes) -> None:
-    """Refuse a text of as many lines as rows in which a row lacks a number, or has one too many."""
-    rows = [np.zeros(0, np.int64)]
-    for each in elements:
-        if columns := tables[each.name]:
-            of_row = [columns[one.name].lengths + (one.count is not None) for one in each.properties]
-            rows.append(np.sum(of_row, axis=0))
-    expected = np.concatenate(rows)
-    characters = np.frombuffer(text, np.uint8)
-    begin = np.flatnonzero((characters > 32) & (np.append(32, characters[:-1]) <= 32))
-    line = np.searchsorted(np.flatnonzero((characters == 10) | (characters == 13)), begin)
-    found = np.diff(np.flatnonzero(np.diff(line, prepend=-1, append=-1)))
-    if len(found) == len(expected) and (found != expected).any():
-        row = np.flatnonzero(found != expected)[0]
-        raise ValueError(f"line {row + 1} after the header has {found[row]} numbers; expected {expected[row]}")
-
-
 def _read(element: _Element, body: bytes, start: int) -> tuple[_Columns, int]:
     """The columns of an element whose rows start at a byte of the body, and where they end."""
     properties, rows = element.properties, element.rows
-    least = sum((each.count or each.values).itemsize for each in properties)
-    if rows * least > len(body) - start:
-        raise ValueError(
-            f"truncated: the header announces {rows} rows of {element.name}, for which {len(body) - start} bytes are "
-            f"left where at least {rows * least} are needed"
-        )
     if not rows or not properties:
         return {}, start
-    places, end = _walk(element, body, start, 1)
-    table = _table(element, body, start, places[0, :, 1].tolist())
+    lengths = _walk(element, body, start, 1)[0][0, :, 1].tolist()
+    table = _table(element, body, start, lengths)
     if table is not None:
         end = start + table.nbytes
-        columns = [(table[f"values {k}"].reshape(-1), np.full(rows, places[0, k, 1])) for k in range(len(properties))]
+        columns = [(table[f"values {k}"].reshape(-1), np.full(rows, length)) for k, length in enumerate(lengths)]
     else:
         places, end = _walk(element, body, start, rows)
         columns = []
@@ -178,13 +143,11 @@ def _table(element: _Element, body: bytes, start: int, lengths: list[int]) -> ND
     for number, (each, length) in enumerate(zip(element.properties, lengths, strict=True)):
         fields += [] if each.count is None else [(f"count {number}", each.count)]
         fields.append((f"values {number}", each.values, (length,)))
-    row = np.dtype(fields)
-    if row.itemsize * element.rows > len(body) - start:
+    row, lists = np.dtype(fields), [number for number, each in enumerate(element.properties) if each.count is not None]
+    if lists and row.itemsize * element.rows > len(body) - start:
         return None
     table = np.frombuffer(body, row, element.rows, start)
-    counts = [name for name in row.fields or () if name.startswith("count")]
-    alike = all((table[name] == lengths[int(name.split()[1])]).all() for name in counts)
-    return table if alike else None
+    return table if all((table[f"count {number}"] == lengths[number]).all() for number in lists) else None
 
 
 def _walk(element: _Element, body: bytes, at: int, rows: int) -> tuple[NDArray[np.int64], int]:
@@ -215,7 +178,7 @@ def _mesh(files: SceneFiles, tables: dict[str, _Columns], pictures: list[str]) -
         )
     named = listed.values.astype(np.int64)
     if len(named) and not 0 <= named.min() <= named.max() < len(positions):
-        raise SceneError(f"{files.path}: a face names vertices {named.min()} to {named.max()} of {len(positions)}")
+        raise ValueError(f"a face names vertices {named.min()} to {named.max()} of {len(positions)}")
     corners, faces = triangulate(listed.lengths, named, positions)
     triangles = named[corners]
     colours, of_faces, uv = _colours(vertex), _colours(face), _wedges(face, listed, corners)
@@ -229,15 +192,15 @@ def _mesh(files: SceneFiles, tables: dict[str, _Columns], pictures: list[str]) -
         triangles = np.arange(len(positions)).reshape(-1, 3)
     else:
         uv = next((found for names in _COORDINATES if (found := _together(vertex, names)) is not None), None)
-    textures = [decode_picture(files.read(name), f"{files.path}: {name}") for name in pictures]
-    if colours is None and not (textures and uv is not None):
+    if colours is None and (uv is None or not pictures):
         _warn_of_unread_colours(files, [*vertex, *face], pictures)
+    textures = [decode_picture(files.read(name), f"{files.path}: {name}") for name in pictures]
     if uv is None:
-        textures = []
+        textures, uv = [], np.tile([0.0, 1.0], (len(positions), 1))
     return TexturedMesh(
         positions,
         triangles.astype(np.int32),
-        np.zeros((len(positions), 2), np.float32) if uv is None else (uv * [1, -1] + [0, 1]).astype(np.float32),
+        (uv * [1, -1] + [0, 1]).astype(np.float32),
         np.ones((len(positions), 3), np.float32) if colours is None else colours,
         _texture_index(face, faces, len(textures)),
         textures,
@@ -280,9 +243,8 @@ def _texture_index(face: _Columns, faces: NDArray[np.int64], textures: int) -> N
 
 
 def _warn_of_unread_colours(files: SceneFiles, properties: list[str], pictures: list[str]) -> None:
-    names = [name for name in properties if _COLOUR_LIKE.search(name)]
-    if names:
-        known = "colours are read from " + ", ".join("/".join(each) for each in _COLOURS)
-        warn_once(str(files.path), f"is shown white: its {', '.join(names)} are not followed ({known})")
+    if names := [name for name in properties if _COLOUR_LIKE.search(name)]:
+        known = ", ".join("/".join(each) for each in _COLOURS)
+        warn_once(str(files.path), f"is shown white: its {', '.join(names)} are not followed (known are {known})")
     elif pictures:
         warn_once(str(files.path), f"is shown white: it names {', '.join(pictures)}, but has no texture coordinates")

@@ -3,15 +3,8 @@
 What a config means is followed, for every kind of mesh. Version 0.3.4 itself turns a `.glb` so, but shows a `.ply` or
 `.obj` as it lies, whatever its axes, and without vertex colours (ResourceManager::loadRenderAssetGeneral).
 
-A scene of Replica lies on disk like this (github.com/facebookresearch/Replica-Dataset, README.md):
-
-    replica.scene_dataset_config.json           room_0/habitat/mesh_semantic.ply    quads with an object_id per face
-    room_0/mesh.ply   quads, vertex colours     room_0/habitat/info_semantic.json
-    room_0/textures/  (PTex, not shown here)    room_0/habitat/replica_stage.stage_config.json
-
-Both meshes are Z-up (github.com/facebookresearch/habitat-sim, issue 2631). The stage config says nothing of that: its
-keys are render_asset (`../mesh.ply`), semantic_asset, semantic_descriptor_filename and nav_asset (as quoted in
-github.com/facebookresearch/sound-spaces, issue 143); the axes stand in the dataset config's defaults for stages.
+Replica's meshes (docs/replica.md has its folders) are Z-up (github.com/facebookresearch/habitat-sim, issue 2631). Its
+stage config (render_asset `../mesh.ply`) says nothing of that; the dataset config's defaults for stages do.
 """
 
 import json
@@ -42,18 +35,45 @@ _REPLICA_FILES = ("mesh_semantic.ply", "info_semantic.json", "replica_stage.stag
 _HABITAT = "habitat"
 _FILE_NAME_TAG = "%%CONFIG_NAME_AS_ASSET_FILENAME%%"
 _NEUTRAL = {"origin": [0, 0, 0], "scale": [1, 1, 1], "units_to_meters": 1}
+_NEUTRAL |= {"translation": [0, 0, 0], "rotation": [1, 0, 0, 0], "uniform_scale": 1, "non_uniform_scale": [1, 1, 1]}
 
 
 @dataclass(frozen=True)
 class Layer:
-    """Attributes from one place; of several layers the last one that has a key decides."""
+    """An object of a JSON file; of several layers of attributes, the last one that has a key decides."""
 
     values: Mapping[str, Any]
-    """As they stand in the JSON file."""
     path: Path
-    """That file."""
     where: str = ""
     """Where in the file, as it is put before a key: `stages.default_attributes.`, say."""
+
+    def error(self, key: str, text: str) -> SceneError:
+        """An error that names the file and the key."""
+        return SceneError(f"{self.path}: {self.where}{key}: {text}")
+
+    def member(self, key: str, default: Value) -> Value:
+        """The object, list or text under a key, or the default; SceneError where it is something else."""
+        value = self.values.get(key, default)
+        if value is None and isinstance(default, str):
+            return default
+        if not isinstance(value, type(default)):
+            kind = {dict: "an object", list: "a list", str: "a text"}[type(default)]
+            raise self.error(key, f"expected {kind}, got {shown(value)}")
+        return value
+
+    def cell(self, key: str) -> "Layer":
+        """The object under a key, empty where there is none."""
+        return Layer(self.member(key, {}), self.path, f"{self.where}{key}.")
+
+    def inside(self, key: str, value: str, folder: Path, root: Path) -> Path:
+        """The path that a value stands for, without `..`; SceneError where it leaves `root`, the folder of the data.
+
+        What counts is the path as it is written: links may lead anywhere.
+        """
+        target = folder / value
+        if "\0" in value or not Path(os.path.abspath(target)).is_relative_to(os.path.abspath(root)):
+            raise self.error(key, f"{value!r} lies outside of {root}, the folder of its data")
+        return Path(os.path.normpath(target))
 
 
 @dataclass(frozen=True)
@@ -81,11 +101,7 @@ class SceneLocation:
 
 
 def replica_scene(path: Path) -> Path | None:
-    """The folder of the scene that a mesh or stage config of Replica belongs to, None for any other file.
-
-    Args:
-        path: `room_0/mesh.ply`, `room_0/habitat/mesh_semantic.ply` or the stage config beside it.
-    """
+    """The folder of the scene that a mesh or stage config of Replica belongs to, None for any other file."""
     folder = Path(os.path.abspath(path)).parent
     if path.name in (_REPLICA_FILES[0], _REPLICA_FILES[2]) and folder.name == _HABITAT:
         folder = folder.parent
@@ -100,7 +116,7 @@ def is_replica_scene(folder: Path) -> bool:
     return count > 0 and count + (folder / REPLICA_MESH).is_file() > 1
 
 
-def read_config(path: Path) -> dict[str, Any]:
+def read_config(path: Path) -> Layer:
     """The object that a JSON file holds; SceneError where it cannot be read, or holds something else."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -110,18 +126,7 @@ def read_config(path: Path) -> dict[str, Any]:
         raise SceneError(f"{path}: expected JSON, but it is damaged: {error}") from error
     if not isinstance(content, dict):
         raise SceneError(f"{path}: expected a JSON object, got {shown(content)}")
-    return content
-
-
-def member(cell: dict[str, Any], key: str, default: Value, where: str) -> Value:
-    """The object, list or text under a key of a JSON object, or the default; SceneError where it is something else."""
-    value = cell.get(key, default)
-    if value is None and isinstance(default, str):
-        return default
-    if not isinstance(value, type(default)):
-        kind = {dict: "an object", list: "a list", str: "a text"}[type(default)]
-        raise SceneError(f"{where}{key}: expected {kind}, got {shown(value)}")
-    return value
+    return Layer(content, path)
 
 
 def read_stage(layers: Sequence[Layer], folder: Path, root: Path, *, name: str, axes: Axes = Y_UP) -> tuple[Path, Axes]:
@@ -137,8 +142,7 @@ def read_stage(layers: Sequence[Layer], folder: Path, root: Path, *, name: str, 
     Raises:
         SceneError: an attribute is missing or cannot be right, or moves or scales the stage.
     """
-    for key, neutral in _NEUTRAL.items():
-        expect_neutral(layers, key, neutral)
+    expect_unmoved(layers)
     asset = _asset(layers, folder, root, name)
     up, front = _axes(layers, axes)
     if asset.name.endswith("_semantic.ply") and find(layers, "render_asset_type")[0] in (None, "semantic"):
@@ -154,30 +158,17 @@ def find(layers: Sequence[Layer], key: str) -> tuple[Any, Layer]:
     return (found[-1].values[key], found[-1]) if found else (None, layers[-1])
 
 
-def expect_neutral(layers: Sequence[Layer], key: str, *neutral: Any) -> None:
-    """Refuse, by a SceneError, an attribute that moves, turns or scales a stage: all but the `neutral` values.
+def expect_unmoved(layers: Sequence[Layer]) -> None:
+    """Refuse, by a SceneError, attributes of a stage, or of its place in a scene, that move, turn or scale it.
 
     Habitat-Sim 0.3.4 reads origin, units_to_meters and the stage's place in a scene instance without using them, and
     scales what is seen but not the NavMesh; older versions do not scale. No two simulators would show the same scene.
     """
-    value, layer = find(layers, key)
-    if value is None or value in neutral:
-        return
-    raise SceneError(
-        f"{layer.path}: {layer.where}{key}: expected {shown(neutral[0])} or nothing, got {shown(value)}; stages that "
-        "are moved, turned or scaled are not supported, because versions of Habitat-Sim differ in it: change the mesh"
-    )
-
-
-def inside(target: Path, root: Path, where: str, value: str) -> Path:
-    """The same path without `..`; SceneError where it leaves the data set's folder.
-
-    What counts is the path as it is written: links may lead anywhere.
-    """
-    # No file system takes the null character, and asking about one is an error of its own.
-    if "\0" in value or not Path(os.path.abspath(target)).is_relative_to(os.path.abspath(root)):
-        raise SceneError(f"{where}: {value!r} lies outside of {root}, the folder of its data")
-    return Path(os.path.normpath(target))
+    for key, neutral in _NEUTRAL.items():
+        value, layer = find(layers, key)
+        if value is not None and value != neutral:
+            text = f"expected {shown(neutral)} or nothing, got {shown(value)}; stages that are moved, turned or "
+            raise layer.error(key, text + "scaled are not supported, because versions of Habitat-Sim differ in it")
 
 
 def shown(value: Any) -> str:
@@ -188,14 +179,12 @@ def shown(value: Any) -> str:
 
 def _asset(layers: Sequence[Layer], folder: Path, root: Path, name: str) -> Path:
     value, layer = find(layers, "render_asset")
-    key = f"{layer.path}: {layer.where}render_asset"
-    if not isinstance(value, str) or not value:
-        raise SceneError(f"{key}: expected the path of a mesh ({', '.join(SUFFIXES)}), got {shown(value)}")
-    asset = inside(folder / value.replace(_FILE_NAME_TAG, name), root, key, value)
-    if asset.suffix.lower() not in SUFFIXES:
-        raise SceneError(f"{key}: expected a mesh ({', '.join(SUFFIXES)}), got {shown(value)}")
+    if not isinstance(value, str) or Path(value).suffix.lower() not in SUFFIXES:
+        text = f"expected the path of a mesh ({', '.join(SUFFIXES)}), got {shown(value)}"
+        raise layer.error("render_asset", text)
+    asset = layer.inside("render_asset", value.replace(_FILE_NAME_TAG, name), folder, root)
     if not os.path.isfile(asset):
-        raise SceneError(f"{key}: {broken_link(asset) or f'there is no file {asset}'}")
+        raise layer.error("render_asset", broken_link(asset) or f"there is no file {asset}")
     return asset
 
 
@@ -203,43 +192,24 @@ def _axes(layers: Sequence[Layer], default: Axes) -> Axes:
     if all(find(layers, key)[0] is None for key in ("up", "front")):
         return default
     # A config that names one of them gets the other as Habitat-Sim has it, whatever its asset is.
-    (up, layer), (front, _) = (_direction(layers, key, Y_UP[index]) for index, key in enumerate(("up", "front")))
+    up, front = (_direction(layers, key, Y_UP[index]) for index, key in enumerate(("up", "front")))
+    layer, told = find(layers, "up")[1], f"got up {shown(list(up))} and front {shown(list(front))}"
     if abs(sum(a * b for a, b in zip(up, front, strict=True))) > 1e-5:
-        raise SceneError(
-            f"{layer.path}: {layer.where}up and front: expected two directions at right angles, got "
-            f"up {shown(list(up))} and front {shown(list(front))}; name both"
-        )
-    if _is_turned_over(up, front):
-        raise SceneError(
-            f"{layer.path}: {layer.where}up and front: Habitat-Sim shows a stage with up {shown(list(up))} and front "
-            f"{shown(list(front))} upside down; expected another front, {shown([-item or 0.0 for item in front])} say"
-        )
+        raise layer.error("up and front", f"{told}; expected two directions at right angles; name both")
+    if abs(up[1]) > 1 - 1e-5 and front[2] > 1 - 1e-5:
+        # It takes +Y to `up`, then -Z to `front`, by the shortest turns (CoordinateFrame in its sources); the half turn
+        # between opposite fronts is about an axis at right angles to +Y, which turns `up` over.
+        text = f"{told}, which Habitat-Sim shows upside down; expected another front, [0.0, 0.0, -1.0] say"
+        raise layer.error("up and front", text)
     return up, front
 
 
-def _is_turned_over(up: Vector, front: Vector) -> bool:
-    """Whether Habitat-Sim's frame of these axes has its up pointing down.
-
-    It takes +Y to `up` by the shortest turn, then -Z, as turned by that, to `front` (CoordinateFrame in its sources).
-    When these two are opposite, the half turn between them is made about an axis at right angles to +Y (Quaternion in
-    Magnum's), which is `up` only if `up` is at right angles to +Y.
-    """
-    share = up[2] / (1.0 + up[1]) if up[1] > -1.0 else 0.0
-    before = (share * up[0], share * (1.0 + up[1]), share * up[2] - 1.0)
-    return sum(a * b for a, b in zip(before, front, strict=True)) < -1.0 + 2e-5 and abs(up[1]) > 1e-5
-
-
-def _direction(layers: Sequence[Layer], key: str, default: Vector) -> tuple[Vector, Layer]:
+def _direction(layers: Sequence[Layer], key: str, default: Vector) -> Vector:
     value, layer = find(layers, key)
     if value is None:
-        return default, layer
-    if not isinstance(value, list) or len(value) != 3 or not all(_is_number(item) for item in value):
-        raise SceneError(f"{layer.path}: {layer.where}{key}: expected three numbers, got {shown(value)}")
-    length = math.hypot(*value)
+        return default
+    numbers = isinstance(value, list) and len(value) == 3 and all(isinstance(item, (int, float)) for item in value)
+    length = math.hypot(*value) if numbers else 0.0
     if not 0 < length < math.inf:
-        raise SceneError(f"{layer.path}: {layer.where}{key}: expected a direction, got {shown(value)}")
-    return (value[0] / length, value[1] / length, value[2] / length), layer
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        raise layer.error(key, f"expected a direction of three numbers, got {shown(value)}")
+    return (value[0] / length, value[1] / length, value[2] / length)

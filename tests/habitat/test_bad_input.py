@@ -42,9 +42,9 @@ def only_ours(stderr: str) -> list[str]:
 DATASET = "data/small.scene_dataset_config.json"
 # Options, exit code, error.
 MISTAKES = [
-    ("--scene rom.glb", 1, r"rom\.glb: no such scene file; did you mean room\.glb\?"),
+    ("--scene rom.glb", 1, r"rom\.glb: no such scene file; did you mean 'room\.glb'\?"),
     ("--scene no/where/room.glb", 1, r"no/where/room\.glb: there is no folder no/where"),
-    ("--scene room", 2, r"room: expected a scene file \(\.glb, .*\), .*, got a name with no suffix"),
+    ("--scene room", 2, r"room: expected a scene file, got the suffix ''; a scene is a mesh \(\.glb .*\), .*"),
     ("--scene builtin:x", 2, r"builtin:x: expected builtin:SEED with an integer SEED >= 0, got 'x'"),
     ("--scene data", 1, r"data: expected a scene file, found a folder that is no scene of Replica"),
     ("--scene wall.glb", 1, r"wall\.glb: Habitat-Sim found no floor for its NavMesh; is the scene Y-up, in metres\?"),
@@ -58,7 +58,7 @@ MISTAKES = [
     (
         f"--scene {DATASET}:withs",
         1,
-        r".*: has no scene 'withs'; did you mean with\b.*\? it has 3 scenes: room, with, .*",
+        r".*: has no scene 'withs'; it has 3 scenes, such as room, with, .*; did you mean 'with\b.*'\?",
     ),
     (
         "--scene room.glb --gpu 99",

@@ -14,8 +14,8 @@ from avp_habitat.scenes.builtin.noise import Random
 from avp_habitat.scenes.builtin.shapes import Float, MeshSurface, Rectangle, moved
 from avp_habitat.scenes.builtin.shell import CURTAIN_M, Point, Shell, Wall, curtain_bottom
 
-CELL_M = 0.1
-RADIUS_M = 0.15
+_CELL_M = 0.1
+_RADIUS_M = 0.15
 """The agent's radius and half a cell, so that the answer errs on the safe side."""
 _QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 """Cosine and sine of quarter turns."""
@@ -30,25 +30,6 @@ _Spots = Callable[[Wall], list[Point]]
 _MOST_SPOTS = 120
 
 
-def free_cells(shell: Shell, blocks: list[Rectangle]) -> NDArray[np.bool_]:
-    """`(rows, columns)` cells of 0.1 m, rows along z, where an agent can stand.
-
-    Args:
-        shell: the empty room.
-        blocks: x0, z0, x1, z1 in metres of what stands on the floor.
-    """
-    x0, z0, x1, z1 = shell.bounds
-    x = np.arange(x0 + CELL_M / 2, x1, CELL_M)
-    z = np.arange(z0 + CELL_M / 2, z1, CELL_M)
-    free = ((z > z0 + RADIUS_M) & (z < z1 - RADIUS_M))[:, None] & ((x > x0 + RADIUS_M) & (x < x1 - RADIUS_M))[None]
-    notch = [shell.notch] if shell.notch is not None else []
-    for a, b, c, d in [*blocks, *notch]:
-        rows = slice(*np.searchsorted(z, (b - RADIUS_M, d + RADIUS_M)))
-        columns = slice(*np.searchsorted(x, (a - RADIUS_M, c + RADIUS_M)))
-        free[rows, columns] = False
-    return free
-
-
 def largest_part(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The largest 4-connected part of a mask."""
     parts, _ = label(free)  # pyright: ignore[reportGeneralTypeIssues]
@@ -57,13 +38,19 @@ def largest_part(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return free & (parts == sizes.argmax())
 
 
-def walkable_share(shell: Shell, blocks: list[Rectangle]) -> float:
-    """Share of the floor in the largest walkable part; 0 where other parts come to more than 0.3 m²."""
-    free = free_cells(shell, blocks)
-    part = largest_part(free)
-    if (int(free.sum()) - int(part.sum())) * CELL_M**2 > 0.3:
-        return 0.0
-    return int(part.sum()) * CELL_M**2 / shell.floor_area
+def _walkable_share(shell: Shell, blocks: list[Rectangle]) -> float:
+    """Share of the floor in the largest walkable part beside blocks; 0 where other parts come to more than 0.3 m²."""
+    x0, z0, x1, z1 = shell.bounds
+    x = np.arange(x0 + _CELL_M / 2, x1, _CELL_M)
+    z = np.arange(z0 + _CELL_M / 2, z1, _CELL_M)
+    inside_x = (x > x0 + _RADIUS_M) & (x < x1 - _RADIUS_M)
+    free = ((z > z0 + _RADIUS_M) & (z < z1 - _RADIUS_M))[:, None] & inside_x
+    for a, b, c, d in filter(None, [*blocks, shell.notch]):
+        rows = slice(*np.searchsorted(z, (b - _RADIUS_M, d + _RADIUS_M)))
+        columns = slice(*np.searchsorted(x, (a - _RADIUS_M, c + _RADIUS_M)))
+        free[rows, columns] = False
+    part = int(largest_part(free).sum())
+    return 0.0 if (int(free.sum()) - part) * _CELL_M**2 > 0.3 else part * _CELL_M**2 / shell.floor_area
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +61,8 @@ class Placed:
     axes: Float
     """`(3, 3)` columns are the piece's x, y and z in the world."""
     position: Point
-    """x, z of its foot in metres."""
     footprint: Rectangle
-    """x0, z0, x1, z1 of the axis-aligned rectangle that it keeps to."""
+    """The axis-aligned rectangle that it keeps to."""
 
     def surfaces(self) -> list[MeshSurface]:
         """Its triangles in the world frame."""
@@ -94,26 +80,23 @@ class Placed:
 
 @dataclass(frozen=True)
 class Block:
-    """An axis-aligned box that furniture occupies or that must stay free."""
+    """A box over a rectangle that furniture occupies or that must stay free, between two heights in metres."""
 
-    x0: float
-    z0: float
-    x1: float
-    z1: float
+    area: Rectangle
     low: float = 0.0
     high: float = 2.0
     solid: bool = True
 
     def meets(self, other: "Block", margin: float = 0.0) -> bool:
         """Whether two boxes come closer than the margin on the floor and overlap in height."""
-        along_x = self.x0 < other.x1 + margin and other.x0 < self.x1 + margin
-        along_z = self.z0 < other.z1 + margin and other.z0 < self.z1 + margin
-        return along_x and along_z and self.low < other.high and other.low < self.high
+        (a, b, c, d), (x0, z0, x1, z1) = self.area, other.area
+        close = a < x1 + margin and x0 < c + margin and b < z1 + margin and z0 < d + margin
+        return close and self.low < other.high and other.low < self.high
 
     @property
     def flat(self) -> "Block":
         """The same rectangle from the floor to 2 m."""
-        return Block(self.x0, self.z0, self.x1, self.z1)
+        return Block(self.area)
 
 
 class FloorPlan:
@@ -142,16 +125,14 @@ class FloorPlan:
             return False
         solids, rugs = [], []
         for stand in stands:
-            (rugs if stand.piece.height <= FLAT_M else solids).append(Block(*stand.footprint, 0.03, stand.piece.height))
+            (rugs if stand.piece.height <= FLAT_M else solids).append(Block(stand.footprint, 0.03, stand.piece.height))
         areas = [
             _before(wall, (right + a, inwards + b, right + c, inwards + d), 0.03, 1.9) for a, b, c, d in group.clear
         ]
-        if not all(self.shell.contains(area.x0, area.z0, area.x1, area.z1) for area in areas):
+        if not all(self.shell.contains(*block.area) for block in areas) or self._are_in_the_way(solids, rugs, areas):
             return False
-        if self._are_in_the_way(solids, rugs, areas):
-            return False
-        rectangles = [(b.x0, b.z0, b.x1, b.z1) for b in [*self.blocks, *solids] if b.solid]
-        if walkable_share(self.shell, rectangles) < least_share:
+        standing = [block.area for block in [*self.blocks, *solids] if block.solid]
+        if _walkable_share(self.shell, standing) < least_share:
             return False
         self.placed += stands
         self.blocks += solids + areas
@@ -180,13 +161,13 @@ class FloorPlan:
 
     def is_free(self, stand: Placed, low: float, high: float, margin: float) -> bool:
         """Whether nothing comes closer than a margin to where a piece would hang between two heights, metres."""
-        block = Block(*stand.footprint, low, high)
+        block = Block(stand.footprint, low, high)
         return self.shell.contains(*stand.footprint) and not any(block.meets(other, margin) for other in self.blocks)
 
     def hang(self, stand: Placed, low: float, high: float) -> None:
         """Put something on a wall or ceiling, where it takes no floor."""
         self.placed.append(stand)
-        self.blocks.append(Block(*stand.footprint, low, high, False))
+        self.blocks.append(Block(stand.footprint, low, high, False))
 
 
 def places(start: float, end: float, pitch: float) -> list[float]:
@@ -197,7 +178,7 @@ def places(start: float, end: float, pitch: float) -> list[float]:
 def _before(wall: Wall, rectangle: Rectangle, low: float, high: float, *, solid: bool = False) -> Block:
     """A block before a wall: left, inwards, right, inwards in metres, between two heights."""
     (xa, za), (xb, zb) = wall.point(*rectangle[:2]), wall.point(*rectangle[2:])
-    return Block(min(xa, xb), min(za, zb), max(xa, xb), max(za, zb), low, high, solid)
+    return Block((min(xa, xb), min(za, zb), max(xa, xb), max(za, zb)), low, high, solid)
 
 
 def stand_at(member: Member, wall: Wall, right: float, inwards: float) -> Placed:

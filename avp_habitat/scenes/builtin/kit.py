@@ -27,14 +27,12 @@ class Lamp:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Furniture in its own frame: foot at the origin, y up, front towards +z; extents in metres, centred in x and z."""
+    """Furniture in its own frame: foot at the origin, y up, front to +z; metres, centred in x (width) and z (depth)."""
 
     kind: str
     surfaces: list[MeshSurface]
     width: float
-    """Along x."""
     depth: float
-    """Along z."""
     height: float
     lamps: tuple[Lamp, ...] = ()
 
@@ -46,16 +44,14 @@ def shifted(surfaces: list[MeshSurface], x: float, y: float, z: float) -> list[M
 
 @dataclass(frozen=True)
 class Scheme:
-    """Colours that go together, sRGB in [0, 1]."""
+    """Colours that go together, sRGB in [0, 1]; of walls, `feature` is the one that stands out."""
 
     wall: Colour
     feature: Colour
-    """The wall that stands out."""
     floor: Colour
     wood: Colour
     upholstery: Colour
     accents: tuple[Colour, Colour, Colour]
-    """Cushions, rug, curtains, paintings, books."""
 
 
 SCHEMES = (
@@ -82,7 +78,7 @@ def _brightness(colour: Colour) -> float:
     return 0.3 * colour[0] + 0.59 * colour[1] + 0.11 * colour[2]
 
 
-def legible(ground: Colour, ink: Colour) -> Colour:
+def _legible(ground: Colour, ink: Colour) -> Colour:
     """The ink, darker where it would hardly show on the ground."""
     for _ in range(8):
         if abs(_brightness(ink) - _brightness(ground)) > 0.3:
@@ -133,8 +129,8 @@ class Kit:
         else:
             ground = blend(scheme.feature, scheme.wall, rng.choice((0.0, 0.35, 0.7)))
             ink = blend(scheme.wall, scheme.feature, 0.1) if rng.chance(0.5) else shade(scheme.feature, 0.6)
-            self.feature_wall = Material(partial(finishes.wallpaper, rng, ground, legible(ground, ink)), 1.2, 1.2)
-        ink = legible(scheme.wall, blend(scheme.wall, scheme.feature, 0.85))
+            self.feature_wall = Material(partial(finishes.wallpaper, rng, ground, _legible(ground, ink)), 1.2, 1.2)
+        ink = _legible(scheme.wall, blend(scheme.wall, scheme.feature, 0.85))
         self.papered_wall = self._material(4, finishes.wallpaper, scheme.wall, ink)
         self.ceiling = self._material(5, finishes.plaster, (0.96, 0.96, 0.95), size=2.4)
         self.trim = self._material(6, finishes.paint, (0.96, 0.96, 0.94), size=(1.2, 0.6))

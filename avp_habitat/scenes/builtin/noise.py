@@ -14,15 +14,10 @@ Size = tuple[int, int]
 
 
 class Random:
-    """Random decisions drawn from PCG64's doubles alone, whose bits numpy guarantees.
-
-    Args:
-        seed: 0 or greater, of any size.
-        stream: which of the independent streams of that seed.
-    """
+    """Random decisions drawn from PCG64's doubles alone, whose bits numpy guarantees."""
 
     def __init__(self, seed: int, stream: int = 0) -> None:
-        """Start the stream."""
+        """Start one of the independent streams of a seed of 0 or more."""
         self._random = np.random.Generator(np.random.PCG64([seed, stream])).random
 
     def array(self, shape: int | tuple[int, ...]) -> NDArray[np.float32]:

@@ -265,11 +265,7 @@ def _border(rgb: Field, across: Field, along: Field, colours: list[Colour]) -> F
 def rug(rng: Random, colours: list[Colour], width_m: float, depth_m: float) -> Picture:
     """A whole knotted rug with border, medallions and a lattice field, mirrored about both axes.
 
-    Args:
-        rng: decides the motifs.
-        colours: at least four: rim, lines, field, ink.
-        width_m: extent along u in metres.
-        depth_m: extent along v in metres.
+    The first four colours are those of rim, lines, field and ink; the width is along u.
     """
     size = (int(depth_m * 220), int(width_m * 220))
     _, u, v = grid(*size)

@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
-from avp_habitat.errors import UsageError
 from avp_habitat.scenes.builtin.furnish import Placed, furnish
 from avp_habitat.scenes.builtin.kit import Kit, Lamp
 from avp_habitat.scenes.builtin.noise import Random
-from avp_habitat.scenes.builtin.shapes import Float, MeshSurface, joined
+from avp_habitat.scenes.builtin.shapes import Float, MeshSurface, by_material
 from avp_habitat.scenes.builtin.shell import Shell, build_shell, plan_shell
 from avp_habitat.scenes.mesh import TexturedMesh, merge
 
@@ -25,10 +24,7 @@ _OFF_THE_GRID = 3.7e-5
 
 
 def plan_room(seed: int) -> tuple[Kit, Shell, list[Placed]]:
-    """What a room is made of, the empty room and its furniture, before light is baked; errors as of `generate_room`."""
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise UsageError(f"builtin:{seed}: expected a whole number of 0 or greater as the room's seed, got {seed!r}")
-    seed = int(seed)
+    """What a room is made of, the empty room and its furniture, before light is baked."""
     kit, shell = Kit(seed), plan_shell(Random(seed, 1))
     return kit, shell, furnish(shell, Random(seed, 2), kit)
 
@@ -42,7 +38,6 @@ def _snapped(values: np.ndarray) -> np.ndarray:
 
 
 def _mesh(surface: MeshSurface, colours: np.ndarray) -> TexturedMesh:
-    """A surface as the renderers take it."""
     return TexturedMesh(
         surface.vertices.astype(np.float32),
         surface.triangles.astype(np.int32),
@@ -54,20 +49,13 @@ def _mesh(surface: MeshSurface, colours: np.ndarray) -> TexturedMesh:
 
 
 def generate_room(seed: int) -> TexturedMesh:
-    """A furnished room: metres, Y up, floor at y = 0, closed on all sides, the same for the same seed.
-
-    Args:
-        seed: 0 or greater; decides outline, height, colours, furniture and textures.
-
-    Raises:
-        UsageError: the seed is not a whole number of 0 or greater.
-    """
+    """A furnished room: metres, Y up, floor at y = 0, closed on all sides, the same for the same seed of 0 or more."""
     kit, shell, placed = plan_room(seed)
-    surfaces = build_shell(kit, Random(int(seed), 3), shell)
+    surfaces = build_shell(kit, Random(seed, 3), shell)
     for stand in placed:
         surfaces += stand.surfaces()
     lamps = [lamp for stand in placed for lamp in stand.lamps()]
-    surfaces = [replace(s, vertices=_snapped(s.vertices), uv=_snapped(s.uv)) for s in joined(surfaces)]
+    surfaces = [replace(s, vertices=_snapped(s.vertices), uv=_snapped(s.uv)) for s in by_material(surfaces)]
     colours = _bake(shell, surfaces, lamps)
     return merge([_mesh(surface, colour) for surface, colour in zip(surfaces, colours, strict=True)])
 
@@ -78,8 +66,8 @@ class _Voxels:
     def __init__(self, shell: Shell, surfaces: list[MeshSurface]) -> None:
         """Fill every voxel that a surface passes through and everything outside the room."""
         x0, z0, x1, z1 = shell.bounds
-        self._origin = np.array([x0, 0.0, z0]) - _PADDING * _VOXEL_M - _OFF_THE_GRID
         extent = np.array([x1 - x0, shell.ceiling, z1 - z0])
+        self._origin = np.array([x0, 0.0, z0]) - _PADDING * _VOXEL_M - _OFF_THE_GRID
         shape = tuple(int(n) for n in np.ceil(extent / _VOXEL_M) + 2 * _PADDING)
         filled = np.ones(shape, np.float32)
         inside = [np.arange(n) * _VOXEL_M + _VOXEL_M / 2 - _PADDING * _VOXEL_M for n in shape]
@@ -164,12 +152,11 @@ def _bake(shell: Shell, surfaces: list[MeshSurface], lamps: list[Lamp]) -> list[
     openness = _open_sky(voxels, points, normals)
     ambient = openness * (0.76 + 0.05 * normals[:, 1]).astype(np.float32)
     light = ambient[:, None] * np.array([1.0, 0.99, 0.97], np.float32)
-    for position, strength in _windows(shell):
-        daylight = _from_lamp(voxels, points, normals, position, 2.4) * np.float32(strength)
-        light += daylight[:, None] * np.array([0.97, 1.0, 1.04], np.float32)
-    for lamp in lamps:
-        warm = _from_lamp(voxels, points, normals, np.asarray(lamp.position), 0.9) * np.float32(lamp.strength)
-        light += warm[:, None] * np.array([1.05, 0.92, 0.7], np.float32)
+    lights = [(position, strength, 2.4, (0.97, 1.0, 1.04)) for position, strength in _windows(shell)]
+    lights += [(np.asarray(lamp.position), lamp.strength, 0.9, (1.05, 0.92, 0.7)) for lamp in lamps]
+    for position, strength, reach, colour in lights:
+        falling = _from_lamp(voxels, points, normals, position, reach) * np.float32(strength)
+        light += falling[:, None] * np.array(colour, np.float32)
     light = np.where(light > 0.8, 0.8 + (light - 0.8) * 0.45, light)
     parts = np.split(np.clip(light, 0, 1), np.cumsum([len(surface.vertices) for surface in surfaces])[:-1])
     return [

@@ -104,16 +104,10 @@ def panel(
 ) -> MeshSurface:
     """A flat rectangle, subdivided so that light can vary over it; all lengths are in metres.
 
-    Args:
-        corner: upper left corner as seen from the front.
-        right: edge from there to the right.
-        down: edge from there downwards.
-        material: whose picture measures metres along `right` and `down`, from `origin` on.
-        pitch: largest distance between vertices.
-        fit: part of the picture (u0, v0, u1, v1) to stretch over the rectangle instead.
-        turned: let u of the picture run downwards.
-        origin: how far along right and down the picture starts.
-        holes: rectangles (right0, down0, right1, down1) that are left out.
+    `corner` is the upper left one as seen from the front, from where the edges `right` and `down` lead. The picture
+    measures metres along those, from `origin` on (u runs downwards where it is `turned`), or its part `fit` (u0, v0,
+    u1, v1) is stretched over the rectangle. Vertices are at most `pitch` apart; `holes` (right0, down0, right1, down1)
+    are left out.
     """
     start, across, fall = (np.asarray(part, dtype=np.float64) for part in (corner, right, down))
     width, height = float(np.sqrt((across**2).sum())), float(np.sqrt((fall**2).sum()))
@@ -151,8 +145,6 @@ _FACES = {
     "bottom": ((-1, -1, 1), 0, 2, 1, -1),
 }
 """Of each face: its upper left corner, the axes of right and down, and their signs."""
-
-ALL_FACES = tuple(_FACES)
 
 
 def _face_corners(face: str) -> NDArray[np.int64]:
@@ -200,7 +192,7 @@ def box(
     centre: Vector,
     material: Material,
     *,
-    faces: tuple[str, ...] = ALL_FACES,
+    faces: tuple[str, ...] = tuple(_FACES),
     fit: Rectangle | None = None,
     pitch: float = 0.35,
 ) -> list[MeshSurface]:
@@ -300,17 +292,9 @@ def leaned(surfaces: list[MeshSurface], angle: float) -> list[MeshSurface]:
     return moved(surfaces, np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]]), np.zeros(3))
 
 
-def joined(surfaces: list[MeshSurface]) -> list[MeshSurface]:
-    """The same triangles with one surface per material, in order of first appearance."""
-    by_material: dict[int, list[MeshSurface]] = {}
+def by_material(surfaces: list[MeshSurface]) -> list[MeshSurface]:
+    """The same surfaces with those of one material together, in order of first appearance."""
+    groups: dict[int, list[MeshSurface]] = {}
     for surface in surfaces:
-        by_material.setdefault(id(surface.material), []).append(surface)
-    made = []
-    for parts in by_material.values():
-        starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-        triangles = [part.triangles + np.int32(start) for part, start in zip(parts, starts, strict=True)]
-        vertices, normals, uv = (
-            np.concatenate([getattr(part, name) for part in parts]) for name in ("vertices", "normals", "uv")
-        )
-        made.append(MeshSurface(vertices, normals, uv, np.concatenate(triangles), parts[0].material))
-    return made
+        groups.setdefault(id(surface.material), []).append(surface)
+    return [surface for group in groups.values() for surface in group]

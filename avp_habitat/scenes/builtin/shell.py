@@ -26,7 +26,6 @@ class Wall:
     along: Point
     """Unit vector to the right."""
     length: float
-    """Metres."""
 
     @property
     def inward(self) -> Point:
@@ -46,16 +45,14 @@ class Wall:
 
 @dataclass(frozen=True)
 class Opening:
-    """A window or door in a wall: metres from its left end, and above the floor."""
+    """A `window` or `door` (its kind) in the wall of an index: metres from its left end, and above the floor."""
 
     wall: int
-    """Index of the wall."""
     left: float
     right: float
     bottom: float
     top: float
     kind: str
-    """`"window"` or `"door"`."""
 
 
 @dataclass(frozen=True)
@@ -67,9 +64,7 @@ class Shell:
     notch: Rectangle | None
     """x0, z0, x1, z1 of the rectangle that an L-shaped room lacks."""
     ceiling: float
-    """Height of the ceiling."""
     openings: tuple[Opening, ...]
-    """Windows and the door."""
 
     @cached_property
     def walls(self) -> tuple[Wall, ...]:
