@@ -6,6 +6,7 @@ import tempfile
 import threading
 import weakref
 from dataclasses import astuple
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -39,10 +40,7 @@ def navmesh_area(engine: HabitatEngine, navmesh: Path | None) -> NavigableArea:
     Raises:
         SceneError: there is no floor, or the file is no NavMesh of this scene.
     """
-
-    def below(points: Float) -> NDArray[np.floating]:
-        return surface_below(engine, points)
-
+    below = partial(surface_below, engine)
     engine.recompute_navmesh(NavigationSettings())
     own = area_of_islands(engine.islands(), below, engine.bounds())
     return own if navmesh is None else area_of_file(navmesh, own, below, engine.bounds())
@@ -90,7 +88,6 @@ def _below_in_tile(engine: HabitatEngine, points: Float, corner: Float) -> NDArr
     return top - depth
 
 
-_ONE_EACH = 'SubprocVecEnv(start_method="forkserver"), or avp_sb3.AVPSubprocVecEnv for several scenes'
 _FOCAL_PX, _MOST_PX = 320.0, 1280
 """Points are looked for in images of about this focal length, that of 640x480 pixels at 90°, unless that is larger."""
 _CAMERAS_PER_CALL = 32
@@ -115,8 +112,7 @@ class HabitatSimulator:
         caught here before it happens.
 
         Args:
-            scene: a mesh file, a folder of Replica, a stage config, `NAME.scene_dataset_config.json:ID`, or
-                `builtin:SEED`; see `avp_habitat.scenes.location.locate`.
+            scene: as `avp_habitat.scenes.location.locate` takes it.
             gpu: CUDA device that renders; -1 for none; None for the first one that EGL offers, if any.
             navmesh: a `.navmesh` file; without it the NavMesh is computed for the design's agent.
             up: axis of a mesh file that points up, `y` or `z`.
@@ -214,6 +210,9 @@ def _finer(camera: Intrinsics) -> Intrinsics:
     """The same field of view in more pixels, where a camera has few: coverage must not depend on their number."""
     times = max(1, min(round(_FOCAL_PX / camera.fx), _MOST_PX // max(camera.width, camera.height)))
     return Intrinsics(*(times * value for value in astuple(camera)))
+
+
+_ONE_EACH = 'SubprocVecEnv(start_method="forkserver"), or avp_sb3.AVPSubprocVecEnv for several scenes'
 
 
 class _Process:
