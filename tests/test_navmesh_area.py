@@ -13,6 +13,10 @@ def strip(x0, x1, z0, z1, y):
     return [[a, b, c], [a, c, d]]
 
 
+def bounds_of(triangles):
+    return np.stack([triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))])
+
+
 def flat_floor(points):
     return np.where(points[:, 1] >= FLOOR_M, FLOOR_M, np.nan)
 
@@ -20,7 +24,7 @@ def flat_floor(points):
 def test_a_foreign_navigation_mesh_becomes_the_area_on_the_true_floor():
     # An L of two rectangles whose common edge agrees up to a hundredth of a millimetre, 0.2 m above the floor.
     triangles = np.array(strip(0, 3, 0, 1, 0.27) + strip(0, 1, 1.00001, 4, 0.27))
-    area = area_in_outline(triangles, flat_floor, NavigationSettings())
+    area = area_in_outline(triangles, flat_floor, NavigationSettings(), bounds_of(triangles))
     assert area.area_m2 == pytest.approx(6.0, abs=0.01)
     assert len(area.centres) * 0.01 == pytest.approx(6.0, abs=0.1)
     np.testing.assert_allclose(area.centres[:, 1], FLOOR_M)
@@ -31,4 +35,6 @@ def test_a_foreign_navigation_mesh_becomes_the_area_on_the_true_floor():
 
 def test_of_separate_pieces_the_largest_is_taken():
     triangles = np.array(strip(0, 1, 0, 1, 0.2) + strip(5, 8, 0, 1, 0.2))
-    assert area_in_outline(triangles, flat_floor, NavigationSettings()).area_m2 == pytest.approx(3.0, abs=0.01)
+    assert area_in_outline(triangles, flat_floor, NavigationSettings(), bounds_of(triangles)).area_m2 == pytest.approx(
+        3.0, abs=0.01
+    )

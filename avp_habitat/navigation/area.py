@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from avp_habitat.navigation.geodesic import Roadmap
     from avp_habitat.navigation.walls import Walls
 
 Float = NDArray[np.float64]
@@ -120,18 +119,21 @@ class NavigableArea:
             ValueError: an agent starts outside of the area, or a number is not finite.
         """
         from avp_habitat.navigation.sliding import slide
-        from avp_habitat.navigation.walls import are_inside
+        from avp_habitat.navigation.walls import are_inside, off_walls
 
         begin, move = _on_plane(positions), _on_plane(displacements)
         if not (np.isfinite(begin).all() and np.isfinite(move).all()):
             raise ValueError("expected finite positions and displacements, got NaN or infinity")
-        begin = self._pulled_inside(begin)
-        outside = np.flatnonzero(~are_inside(self._walls, begin))
-        if len(outside):
-            raise ValueError(
-                f"expected agents over the navigable area; {len(outside)} of {len(begin)} are outside, "
-                f"the first at x, z = {begin[outside[0]]}"
-            )
+        inside = are_inside(self._walls, begin)
+        if not inside.all():
+            # On the outline, or within the skin outside of it.
+            begin = np.where(inside[:, None], begin, off_walls(self._walls, begin))
+            outside = np.flatnonzero(~are_inside(self._walls, begin))
+            if len(outside):
+                raise ValueError(
+                    f"expected agents over the navigable area; {len(outside)} of {len(begin)} are outside, "
+                    f"the first at x, z = {begin[outside[0]]}"
+                )
         return self._on_floor(slide(self._walls, begin, move))
 
     def random_points(self, rng: np.random.Generator, count: int) -> Float:
@@ -143,44 +145,6 @@ class NavigableArea:
             accepted.append(points[self.contains(points)])
         return np.concatenate(accepted)[:count]
 
-    def geodesic_distance(self, start: Float, goals: Float) -> Float:
-        """Lengths of the shortest walks on the floor plane from `start` `(3,)` to `goals` `(n, 3)`.
-
-        Never shorter than the true shortest walk and at most 2 mm longer for every corner that it turns at.
-
-        Returns:
-            `(n,)` metres; inf where start or goal lies outside of the area.
-        """
-        return self._walks(start, goals)[0]
-
-    def geodesic_path(self, start: Float, goal: Float) -> Float:
-        """Corners `(k, 3)` of the shortest walk, from `start` `(3,)` to `goal` `(3,)`, on the floor; k = 0 for none."""
-        length, last, before = self._walks(start, np.asarray(goal)[None])
-        if not np.isfinite(length[0]):
-            return np.empty((0, 3))
-        corners, at = [_on_plane(np.asarray(goal)[None])[0]], int(last[0])
-        while at >= 0:
-            corners.append(self._roadmap.points[at])
-            at = int(before[at])
-        corners.append(_on_plane(np.asarray(start)[None])[0])
-        return self._on_floor(np.array(corners[::-1]))
-
-    def _walks(self, start: Float, goals: Float) -> tuple[Float, NDArray, NDArray]:
-        from avp_habitat.navigation.geodesic import distances
-        from avp_habitat.navigation.walls import are_inside, off_walls
-
-        begin, ends = (off_walls(self._walls, _on_plane(points)) for points in (np.asarray(start)[None], goals))
-        length, last, before = distances(self._walls, self._roadmap, begin[0], ends)
-        reachable = are_inside(self._walls, ends) & are_inside(self._walls, begin)
-        return np.where(reachable, length, np.inf), last, before
-
-    def _pulled_inside(self, on_plane: Float) -> Float:
-        """The same `(n, 2)` points; those on the outline or within the skin outside of it are moved inside."""
-        from avp_habitat.navigation.walls import are_inside, off_walls
-
-        inside = are_inside(self._walls, on_plane)
-        return on_plane if inside.all() else np.where(inside[:, None], on_plane, off_walls(self._walls, on_plane))
-
     def _on_floor(self, on_plane: Float) -> Float:
         points = np.stack([on_plane[:, 0], np.zeros(len(on_plane)), on_plane[:, 1]], axis=1)
         points[:, 1] = self.floor_height(points)
@@ -191,12 +155,6 @@ class NavigableArea:
         from avp_habitat.navigation.walls import make_walls
 
         return make_walls(list(self.rings))
-
-    @cached_property
-    def _roadmap(self) -> "Roadmap":
-        from avp_habitat.navigation.geodesic import make_roadmap
-
-        return make_roadmap(self._walls, list(self.rings))
 
 
 def _on_plane(points: Float) -> Float:

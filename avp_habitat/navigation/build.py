@@ -1,5 +1,9 @@
 """From a triangle mesh to its navigable area: voxels, standing places, one part, its outline, its floor."""
 
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,9 +11,9 @@ from avp_habitat.errors import SceneError
 from avp_habitat.navigation.area import Float, NavigableArea, SurfaceBelow
 from avp_habitat.navigation.filters import standing_places
 from avp_habitat.navigation.heightfield import Heightfield, check_size, level_triangles, voxelise
-from avp_habitat.navigation.parts import Part, common_place, connected_parts, lay_flat, main_part, place_near
+from avp_habitat.navigation.parts import common_place, connected_parts, lay_flat, main_part, place_near
 from avp_habitat.navigation.settings import NavigationSettings
-from avp_habitat.navigation.walls import SKIN_M, Walls, are_inside, largest_piece, make_walls, off_walls, outline
+from avp_habitat.navigation.walls import SKIN_M, are_inside, largest_piece, make_walls, off_walls, outline
 from avp_habitat.scenes.mesh import TexturedMesh
 
 _REACH_CELLS = 8
@@ -48,14 +52,19 @@ def build_area(
         seed = common_place(places, part, main_part(places, part))
     else:
         seed = place_near(places, part, field.shape[1], _voxel_of(start, field, settings))
-    flat = lay_flat(places, part, seed, field.shape)
-    rings = [
-        field.origin[[0, 2]].astype(np.float64) + ring * settings.voxel_m
-        for ring in outline(flat.inside, settings.edge_max_error)
-    ]
+    inside, floor = lay_flat(places, part, seed, field.shape)
+    low = field.origin.astype(np.float64)
+    rings = [low[[0, 2]] + ring * settings.voxel_m for ring in outline(inside, settings.edge_max_error)]
     if not rings:
         raise SceneError(_no_place(vertices, settings))
-    return _with_floor(flat, rings, field.origin.astype(np.float64), surface_below, settings)
+    # Centres of cells lie in the middle of voxels.
+    stride, cell_m = settings.cell_voxels, settings.cell_voxels * settings.voxel_m
+    origin = low[[0, 2]] + (settings.voxel_m - cell_m) / 2
+    cells = _cells_within(rings, origin, [math.ceil(size / stride) for size in inside.shape], cell_m)
+    voxel_floor = np.where(inside, low[1] + floor * settings.voxel_height_m, np.nan)
+    above = continued(voxel_floor, _REACH_CELLS, np.fmax)[::stride, ::stride][cells.mask]
+    top = np.nan_to_num(above, nan=float(np.nanmax(voxel_floor)))
+    return _on_true_floor(cells, top, surface_below, settings, deepest_voxels=2 * settings.climb_voxels + 1)
 
 
 def _used(mesh: TexturedMesh) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
@@ -97,26 +106,8 @@ def _voxel_of(point: NDArray, field: Heightfield, settings: NavigationSettings) 
     return z // settings.voxel_m, x // settings.voxel_m, y / settings.voxel_height_m
 
 
-def _with_floor(
-    flat: Part, rings: list[Float], low: Float, surface_below: SurfaceBelow, settings: NavigationSettings
-) -> NavigableArea:
-    """Sample the outline at the cells' centres, which lie in the middle of voxels, and cast a ray down at each."""
-    stride = max(1, round(settings.cell_m / settings.voxel_m))
-    cell = stride * settings.voxel_m
-    origin = low[[0, 2]] + (settings.voxel_m - cell) / 2
-    rows, columns = ((size + stride - 1) // stride for size in flat.inside.shape)
-    x = origin[0] + (np.arange(columns) + 0.5) * cell
-    z = origin[1] + (np.arange(rows) + 0.5) * cell
-    centres = np.stack(np.meshgrid(x, z), axis=-1)
-    mask = _stands_clear(make_walls(rings), centres.reshape(-1, 2)).reshape(rows, columns)
-    voxel_floor = np.where(flat.inside, low[1] + flat.floor * settings.voxel_height_m, np.nan)
-    above = continued(voxel_floor, _REACH_CELLS, np.fmax)[::stride, ::stride][mask]
-    top = np.nan_to_num(above, nan=float(np.nanmax(voxel_floor)))
-    return _over_cells(rings, origin, mask, top, surface_below, settings, deepest_voxels=2 * settings.climb_voxels + 1)
-
-
 def area_in_outline(
-    triangles: Float, surface_below: SurfaceBelow, settings: NavigationSettings, bounds: Float | None = None
+    triangles: Float, surface_below: SurfaceBelow, settings: NavigationSettings, bounds: Float
 ) -> NavigableArea:
     """The navigable area of a navigation mesh that was made elsewhere, on the scene's true floor.
 
@@ -125,8 +116,7 @@ def area_in_outline(
             the floor by what their maker rounded up.
         surface_below: finds the scene's first surface straight below points, which come on few different heights.
         settings: of the cells.
-        bounds: `(2, 3)` least and greatest corner of the scene's mesh in metres: cells then lie where `build_area` lays
-            them; without, they begin at the outline.
+        bounds: `(2, 3)` least and greatest corner of the scene's mesh, metres: cells lie where `build_area` lays them.
 
     Raises:
         SceneError: the mesh is smaller than one cell, or no ray meets the floor.
@@ -136,33 +126,27 @@ def area_in_outline(
     shapes = np.asarray(shapely.polygons(triangles[:, :, [0, 2]]))
     # Neighbours share corners only up to rounding; a seam would cut the area in two.
     rings = largest_piece(shapely.union_all(shapely.buffer(shapes, SKIN_M, join_style="mitre")))
-    low, size = _cells_over(rings[0], bounds, settings)
-    columns, rows = size
-    x = low[0] + (np.arange(columns) + 0.5) * settings.cell_m
-    z = low[1] + (np.arange(rows) + 0.5) * settings.cell_m
-    centres = np.stack(np.meshgrid(x, z), axis=-1)
-    mask = _stands_clear(make_walls(rings), centres.reshape(-1, 2)).reshape(rows, columns)
-    floor = _height_on(triangles, shapes, centres[mask])
+    cell_m = settings.cell_voxels * settings.voxel_m
+    cells = _cells_within(rings, *_grid_over(rings[0], bounds, cell_m, settings.voxel_m), cell_m)
+    floor = _height_on(triangles, shapes, cells.centres)
     # On half voxels, so that a slope is asked about on few heights.
     step = settings.voxel_height_m / 2
     top = np.ceil(floor / step - 1e-6) * step
     # A navigation mesh follows the floor's outline; across a slope its few corners leave it well above the floor.
-    return _over_cells(rings, low, mask, top, surface_below, settings, deepest_voxels=settings.height_voxels)
+    return _on_true_floor(cells, top, surface_below, settings, deepest_voxels=settings.height_voxels)
 
 
-def _cells_over(outer: Float, bounds: Float | None, settings: NavigationSettings) -> tuple[Float, NDArray[np.int64]]:
-    """Least corner x, z of the cells over an outline, and how many columns and rows there are."""
+def _grid_over(outer: Float, bounds: Float, cell_m: float, voxel_m: float) -> tuple[Float, NDArray[np.int64]]:
+    """Least corner x, z of the cells over an outline and the scene, and how many rows and columns there are."""
     low, high = outer.min(axis=0), outer.max(axis=0)
-    if bounds is None:
-        return low, np.ceil((high - low) / settings.cell_m).astype(np.int64)
-    origin = bounds[0, [0, 2]] + (settings.voxel_m - settings.cell_m) / 2
+    origin = bounds[0, [0, 2]] + (voxel_m - cell_m) / 2
     # Recast rounds the number of voxels.
-    voxels = np.floor((bounds[1] - bounds[0])[[0, 2]] / settings.voxel_m + 0.5)
-    cells = np.ceil(voxels * settings.voxel_m / settings.cell_m - 1e-6).astype(np.int64)
+    voxels = np.floor((bounds[1] - bounds[0])[[0, 2]] / voxel_m + 0.5)
+    cells = np.ceil(voxels * voxel_m / cell_m - 1e-6).astype(np.int64)
     # A mesh of another scene may lie beside this one.
-    before = np.maximum(np.ceil((origin - low) / settings.cell_m - 1e-6), 0).astype(np.int64)
-    after = np.maximum(np.ceil((high - origin) / settings.cell_m - 1e-6).astype(np.int64), cells)
-    return origin - before * settings.cell_m, before + after
+    before = np.maximum(np.ceil((origin - low) / cell_m - 1e-6), 0).astype(np.int64)
+    after = np.maximum(np.ceil((high - origin) / cell_m - 1e-6).astype(np.int64), cells)
+    return origin - before * cell_m, (before + after)[::-1]
 
 
 def _height_on(triangles: Float, shapes: NDArray, points: Float) -> Float:
@@ -179,41 +163,48 @@ def _height_on(triangles: Float, shapes: NDArray, points: Float) -> Float:
     return a[:, 1] + right * (b - a)[:, 1] + up * (c - a)[:, 1]
 
 
-def _over_cells(
-    rings: list[Float],
-    origin: Float,
-    mask: NDArray[np.bool_],
-    floor: Float,
-    surface_below: SurfaceBelow,
-    settings: NavigationSettings,
-    *,
-    deepest_voxels: int,
+class _Cells(NamedTuple):
+    """The navigable cells within an outline."""
+
+    rings: list[Float]
+    cell_m: float
+    origin: Float
+    """`(2,)` x and z of the least corner."""
+    mask: NDArray[np.bool_]
+    """`(rows, columns)`; True where the centre is inside and not on a wall, where an agent could not stand."""
+    centres: Float
+    """`(m, 2)` x and z of the navigable ones."""
+
+
+def _cells_within(rings: list[Float], origin: Float, shape: Sequence[int] | NDArray, cell_m: float) -> _Cells:
+    rows, columns = shape
+    x = origin[0] + (np.arange(columns) + 0.5) * cell_m
+    z = origin[1] + (np.arange(rows) + 0.5) * cell_m
+    points, walls = np.stack(np.meshgrid(x, z), axis=-1).reshape(-1, 2), make_walls(rings)
+    navigable = are_inside(walls, points) & (off_walls(walls, points) == points).all(axis=1)
+    if not navigable.any():
+        raise SceneError(f"the navigable area is smaller than one cell of {cell_m:g} m; is the scene not in metres?")
+    return _Cells(rings, cell_m, origin, navigable.reshape(rows, columns), points[navigable])
+
+
+def _on_true_floor(
+    cells: _Cells, floor: Float, surface_below: SurfaceBelow, settings: NavigationSettings, *, deepest_voxels: int
 ) -> NavigableArea:
     """The area whose navigable cells have these `(m,)` floor heights, each made true by a ray from a step above.
 
     What is seen farther below than `deepest_voxels` is not this floor.
     """
-    cell = max(1, round(settings.cell_m / settings.voxel_m)) * settings.voxel_m
-    if not mask.any():
-        raise SceneError(f"the navigable area is smaller than one cell of {cell:g} m; is the scene not in metres?")
-    rows, columns = np.nonzero(mask)
-    x, z = origin[0] + (columns + 0.5) * cell, origin[1] + (rows + 0.5) * cell
     top = floor + settings.climb_voxels * settings.voxel_height_m
+    x, z = cells.centres.T
     found = np.asarray(surface_below(np.stack([x, top, z], axis=1)), dtype=np.float64)
     deepest = deepest_voxels * settings.voxel_height_m + SKIN_M
-    heights = np.full(mask.shape, np.nan)
-    heights[mask] = np.where((top - found >= 0) & (top - found <= deepest), found, np.nan)
+    heights = np.full(cells.mask.shape, np.nan)
+    heights[cells.mask] = np.where((top - found >= 0) & (top - found <= deepest), found, np.nan)
     if not np.isfinite(heights).any():
         raise SceneError("no ray meets the floor below the navigable cells: the mesh and its ray caster disagree")
     heights = continued(heights, _REACH_CELLS, np.fmin)
-    return NavigableArea(
-        cell, origin, mask, np.where(np.isfinite(heights), heights, np.nanmedian(heights)), tuple(rings)
-    )
-
-
-def _stands_clear(walls: Walls, points: Float) -> NDArray[np.bool_]:
-    """`(n,)` whether `(n, 2)` points are inside and not on a wall, where an agent could not stand."""
-    return are_inside(walls, points) & (off_walls(walls, points) == points).all(axis=1)
+    heights = np.where(np.isfinite(heights), heights, np.nanmedian(heights))
+    return NavigableArea(cells.cell_m, cells.origin, cells.mask, heights, tuple(cells.rings))
 
 
 def continued(heights: Float, reach: int, choose: np.ufunc) -> Float:

@@ -4,7 +4,7 @@ import difflib
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,52 +14,25 @@ from avp_habitat.navigation.area import Float, NavigableArea, SurfaceBelow
 from avp_habitat.navigation.build import area_in_outline
 from avp_habitat.navigation.settings import NavigationSettings
 
-_SET = np.dtype(
-    [
-        ("magic", "S4"),
-        ("version", "<i4"),
-        ("tiles", "<i4"),
-        ("place", "<f4", 5),
-        ("most_tiles", "<i4"),
-        ("polys", "<i4"),
-    ]
-)
-_SETTINGS = np.dtype(
-    [
-        *((name, "<f4") for name in ("cell_size", "cell_height")),
-        *((name, "<f4") for name in ("agent_height", "agent_radius", "agent_max_climb", "agent_max_slope")),
-        *((name, "<f4") for name in ("region_min_size", "region_merge_size", "edge_max_len", "edge_max_error")),
-        *((name, "<f4") for name in ("verts_per_poly", "detail_sample_dist", "detail_sample_max_error")),
-        ("filters", "u1", 4),
-    ]
-)
-_VERSIONS = (1, 2)
+# The file as Habitat-Sim writes it, and Detour 7's structures of its one tile (DetourNavMesh.h).
 _OF_AGENT = ("agent_height", "agent_radius", "agent_max_climb", "agent_max_slope")
+_COUNTS = ("polys", "vertices", "links", "details", "detail_vertices", "detail_triangles", "boxes", "connections")
+_SET = np.dtype([("magic", "S4"), ("version", "<i4"), ("tiles", "<i4"), ("place", "<f4", 5), ("most", "<i4", 2)])
+_SETTINGS = np.dtype(
+    [("voxel", "<f4", 2), *((name, "<f4") for name in _OF_AGENT), ("others", "<f4", 7), ("filters", "u1", 4)]
+)
 _TILE = np.dtype([("reference", "<u4"), ("bytes", "<i4")])
 _HEADER = np.dtype(
     [
-        ("magic", "S4"),
-        ("version", "<i4"),
-        ("place", "<i4", 3),
-        ("user", "<u4"),
-        ("polys", "<i4"),
-        ("vertices", "<i4"),
-        ("links", "<i4"),
-        ("details", "<i4"),
-        ("detail_vertices", "<i4"),
-        ("detail_triangles", "<i4"),
-        ("boxes", "<i4"),
-        ("connections", "<i4"),
-        ("first_connection", "<i4"),
-        ("agent", "<f4", 3),
-        ("bounds", "<f4", (2, 3)),
-        ("quantum", "<f4"),
+        *(("magic", "S4"), ("version", "<i4"), ("place", "<i4", 4)),
+        *((name, "<i4") for name in _COUNTS),
+        *(("first_connection", "<i4"), ("agent_and_bounds", "<f4", 10)),
     ]
 )
 _POLY = np.dtype(
     [("link", "<u4"), ("corners", "<u2", 6), ("beside", "<u2", 6), ("flags", "<u2"), ("count", "u1"), ("kind", "u1")]
 )
-_LINK_BYTES = 12
+_LINK, _POSITION, _CORNERS = np.dtype("V12"), np.dtype(("<f4", 3)), np.dtype(("u1", 4))
 _DETAIL = np.dtype(
     [("vertex", "<u4"), ("triangle", "<u4"), ("vertices", "u1"), ("triangles", "u1"), ("unused", "u1", 2)]
 )
@@ -89,87 +62,81 @@ def read_navmesh(path: Path) -> NavMesh:
         hint = f"; did you mean {near[0]}?" if near else ""
         raise SceneError(f"{path}: no such NavMesh file (.navmesh){hint}")
     try:
-        content = path.read_bytes()
+        content = _Content(path.read_bytes())
+        agent = _agent(content)
+        return NavMesh(_islands(content), agent)
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror}") from error
-    return _Reader(path, content).read()
+    except (ValueError, IndexError) as error:
+        raise SceneError(
+            f"{path}: expected a NavMesh as Habitat-Sim writes it (.navmesh), but {error}; is it damaged?"
+        ) from error
 
 
-class _Reader:
-    def __init__(self, path: Path, content: bytes) -> None:
-        self._path, self._content, self._at = path, content, 0
+class _Content:
+    """Bytes that are taken one structure after the other; ValueError where they end too early."""
 
-    def read(self) -> NavMesh:
-        header = self._take(_SET, 1)[0]
-        if header["magic"] != b"TESM" or int(header["version"]) not in _VERSIONS:
-            self._fail("it does not begin as one")
-        agent = {}
-        if int(header["version"]) == 2:
-            settings = self._take(_SETTINGS, 1)[0]
-            agent = {name: float(settings[name]) for name in _OF_AGENT}
-        self._expect(header["tiles"] == 1, f"its number of tiles, {header['tiles']} where Habitat-Sim writes 1,")
-        tile = self._take(_TILE, 1)[0]
-        self._expect(self._at + int(tile["bytes"]) == len(self._content), "its size")
-        return NavMesh(self._islands(), agent)
+    def __init__(self, content: bytes) -> None:
+        self._content, self._at = content, 0
 
-    def _islands(self) -> list[NDArray[np.float64]]:
-        header = self._take(_HEADER, 1)[0]
-        if header["magic"] != b"VAND" or header["version"] != 7:
-            self._fail("its tile does not begin as one of Detour 7")
-        self._expect(header["details"] == header["polys"] and header["connections"] == 0, "its counts")
-        vertices = self._positions(int(header["vertices"]))
-        polygons = self._take(_POLY, int(header["polys"]))
-        self._check_polygons(polygons, len(vertices))
-        self._take(np.dtype("u1"), _LINK_BYTES * int(header["links"]))
-        triangles, owner = self._triangles(header, polygons, vertices)
-        island = _connected(polygons)
-        walkable = np.unique(island[polygons["flags"] != 0])
-        return [triangles[island[owner] == number] for number in walkable]
+    @property
+    def left(self) -> int:
+        return len(self._content) - self._at
 
-    def _positions(self, count: int) -> NDArray[np.float64]:
-        found = self._take(np.dtype("<f4"), 3 * count).reshape(-1, 3).astype(np.float64)
-        self._expect((np.abs(found) < _FAR_M).all(), "a position")
-        return found
-
-    def _check_polygons(self, polygons: NDArray, vertices: int) -> None:
-        count, beside = polygons["count"][:, None], polygons["beside"]
-        used = np.arange(6) < count
-        self._expect(((count >= 3) & (count <= 6)).all(), "a polygon's number of corners")
-        self._expect((~used | (polygons["corners"] < vertices)).all(), "a polygon's corners")
-        self._expect((~used | (beside <= len(polygons))).all(), "a polygon's neighbours")
-
-    def _triangles(self, header: np.void, polygons: NDArray, vertices: NDArray) -> tuple[NDArray, NDArray]:
-        """`(k, 3, 3)` corners of all triangles, and the `(k,)` polygons that they are part of."""
-        details = self._take(_DETAIL, len(polygons))
-        more = self._positions(int(header["detail_vertices"]))
-        corners = self._take(np.dtype("u1"), 4 * int(header["detail_triangles"])).reshape(-1, 4)[:, :3].astype(np.int64)
-        own = {name: details[name].astype(np.int64) for name in ("vertex", "triangle", "vertices", "triangles")}
-        self._expect((own["vertex"] + own["vertices"] <= len(more)).all(), "a polygon's details")
-        self._expect((own["triangle"] + own["triangles"] <= len(corners)).all(), "a polygon's details")
-        owner = np.repeat(np.arange(len(polygons)), own["triangles"])
-        first = np.cumsum(own["triangles"]) - own["triangles"]
-        corner = corners[own["triangle"][owner] + np.arange(len(owner)) - first[owner]]
-        # A corner's number goes through the polygon's own corners first, and then through its detail vertices.
-        count = polygons["count"].astype(np.int64)[owner, None]
-        self._expect((corner < count + own["vertices"][owner, None]).all(), "a polygon's triangles")
-        of_polygon = polygons["corners"].astype(np.int64)[owner[:, None], np.minimum(corner, count - 1)]
-        of_details = len(vertices) + own["vertex"][owner, None] + np.maximum(corner - count, 0)
-        return np.concatenate([vertices, more])[np.where(corner < count, of_polygon, of_details)], owner
-
-    def _take(self, kind: np.dtype, count: int) -> NDArray:
-        end = self._at + count * kind.itemsize
-        if count < 0 or end > len(self._content):
-            self._fail(f"it ends after {len(self._content)} bytes")
+    def take(self, kind: np.dtype, count: int = 1) -> NDArray:
+        if not 0 <= count * kind.itemsize <= self.left:
+            raise ValueError(f"it ends after {len(self._content)} bytes")
         found = np.frombuffer(self._content, kind, count, self._at)
-        self._at = end
+        self._at += count * kind.itemsize
         return found
 
-    def _expect(self, holds: object, what: str) -> None:
-        if not holds:
-            self._fail(f"{what} cannot be right")
+    def positions(self, count: int) -> NDArray[np.float64]:
+        found = self.take(_POSITION, count).astype(np.float64)
+        if not (np.abs(found) < _FAR_M).all():
+            raise ValueError("a position cannot be right")
+        return found
 
-    def _fail(self, reason: str) -> NoReturn:
-        raise SceneError(f"{self._path}: expected a NavMesh as Habitat-Sim writes it (.navmesh), but {reason}")
+
+def _agent(content: _Content) -> dict[str, float]:
+    start = content.take(_SET)[0]
+    if start["magic"] != b"TESM" or start["version"] not in (1, 2) or start["tiles"] != 1:
+        raise ValueError("it does not begin as one of a single tile")
+    settings = content.take(_SETTINGS)[0] if start["version"] == 2 else None
+    return {} if settings is None else {name: float(settings[name]) for name in _OF_AGENT}
+
+
+def _islands(content: _Content) -> list[NDArray[np.float64]]:
+    size = int(content.take(_TILE)[0]["bytes"])
+    if size != content.left:
+        raise ValueError(f"its tile has {content.left} bytes where {size} are said")
+    header = content.take(_HEADER)[0]
+    if header["magic"] != b"VAND" or header["version"] != 7 or header["details"] != header["polys"]:
+        raise ValueError("its tile does not begin as one of Detour 7")
+    vertices = content.positions(int(header["vertices"]))
+    polygons = content.take(_POLY, int(header["polys"]))
+    content.take(_LINK, int(header["links"]))
+    details = content.take(_DETAIL, len(polygons))
+    more = content.positions(int(header["detail_vertices"]))
+    corners = content.take(_CORNERS, int(header["detail_triangles"]))[:, :3].astype(np.int64)
+    triangles, owner = _triangles(polygons, details, corners, vertices, more)
+    island = _connected(polygons)
+    walkable = np.unique(island[polygons["flags"] != 0])
+    return [triangles[island[owner] == number] for number in walkable]
+
+
+def _triangles(
+    polygons: NDArray, details: NDArray, corners: NDArray, vertices: NDArray, more: NDArray
+) -> tuple[NDArray, NDArray]:
+    """`(k, 3, 3)` corners of all triangles, and the `(k,)` polygons that they are part of."""
+    own = details["triangles"].astype(np.int64)
+    owner = np.repeat(np.arange(len(polygons)), own)
+    first = np.cumsum(own) - own
+    corner = corners[details["triangle"].astype(np.int64)[owner] + np.arange(len(owner)) - first[owner]]
+    # A corner's number goes through the polygon's own corners first, and then through its detail vertices.
+    count = polygons["count"].astype(np.int64)[owner, None]
+    of_polygon = polygons["corners"].astype(np.int64)[owner[:, None], np.minimum(corner, count - 1)]
+    of_details = len(vertices) + details["vertex"].astype(np.int64)[owner, None] + np.maximum(corner - count, 0)
+    return np.concatenate([vertices, more])[np.where(corner < count, of_polygon, of_details)], owner
 
 
 def _connected(polygons: NDArray) -> NDArray[np.integer]:

@@ -1,7 +1,5 @@
 """The connected part of the standing places that a scene's agents live on, kept off the walls by their radius."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,16 +7,6 @@ from avp_habitat.compiled import njit
 from avp_habitat.navigation.filters import SKY, StandingPlaces
 
 _FAR = 255
-
-
-@dataclass(frozen=True)
-class Part:
-    """One connected part as a picture of the floor plane, one voxel column a pixel."""
-
-    inside: NDArray[np.bool_]
-    """`(rows, columns)` columns that the agent's centre may stand in."""
-    floor: NDArray[np.int32]
-    """`(rows, columns)` first voxel above the floor; meaningless outside."""
 
 
 def connected_parts(places: StandingPlaces, radius: int, smallest: int) -> NDArray[np.int64]:
@@ -75,14 +63,19 @@ def common_place(places: StandingPlaces, part: NDArray[np.int64], chosen: int) -
     return int(own[places.floor[own] == np.bincount(places.floor[own]).argmax()][0])
 
 
-def lay_flat(places: StandingPlaces, part: NDArray[np.int64], seed: int, shape: tuple[int, int]) -> Part:
+def lay_flat(
+    places: StandingPlaces, part: NDArray[np.int64], seed: int, shape: tuple[int, int]
+) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
     """The part that holds place `seed`, as a picture; of storeys that lie over each other the nearest one is kept.
 
     Storeys are peeled apart breadth-first along steps from the seed, so that the picture is one sheet on which
     neighbouring columns are a step apart.
+
+    Returns:
+        `(rows, columns)` columns that the agent's centre may stand in; `(rows, columns)` first voxel above the floor,
+        meaningless elsewhere.
     """
-    inside, floor = _sheet(places.column, places.floor, places.neighbour, part == part[seed], seed, shape)
-    return Part(inside, floor)
+    return _sheet(places.column, places.floor, places.neighbour, part == part[seed], seed, shape)
 
 
 @njit(cache=True)

@@ -48,3 +48,8 @@ class NavigationSettings:
     def radius_voxels(self) -> int:
         """Radius in voxels (2 by default)."""
         return math.ceil(self.agent_radius_m / self.voxel_m - 1e-6)
+
+    @property
+    def cell_voxels(self) -> int:
+        """Side of a cell in voxels (2 by default)."""
+        return max(1, round(self.cell_m / self.voxel_m))

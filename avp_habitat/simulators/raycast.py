@@ -76,16 +76,7 @@ class RaycastSimulator:
         return pack_surface(self._mesh)
 
     def render(self, camera_to_world: NDArray[np.floating], intrinsics: Intrinsics, *, rgb: bool) -> Frames:
-        """Depth, and colour when asked for.
-
-        Args:
-            camera_to_world: `(n, 4, 4)` habitat poses.
-            intrinsics: of all n cameras.
-            rgb: whether to compute colours, which costs more than depth alone.
-
-        Returns:
-            n frames; where a ray leaves the scene, depth is 0.0 and colour black.
-        """
+        """Depth, and colour when asked for, of `(n, 4, 4)` habitat poses; black where a ray leaves the scene."""
         poses = np.asarray(camera_to_world, dtype=np.float64)
         shape = (len(poses), intrinsics.height, intrinsics.width)
         depth = np.empty(shape, np.float32)
@@ -155,26 +146,11 @@ class RaycastSimulator:
         return reached
 
     def distance(self, origin: NDArray[np.floating], direction: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Length of rays up to the first surface.
-
-        Args:
-            origin: `(k, 3)` metres, world frame.
-            direction: `(k, 3)` unit vectors.
-
-        Returns:
-            `(k,)` metres, inf where a ray leaves the scene.
-        """
+        """Length of rays up to the first surface; see `simulators.base.SingleRays.distance`."""
         return self._rays.cast(np.concatenate([origin, direction], axis=1).astype(np.float32))["t_hit"]
 
     def surface_below(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Height of the first surface straight below each point.
-
-        Args:
-            points: `(n, 3)` metres, world frame.
-
-        Returns:
-            `(n,)` y in metres, NaN where there is nothing below.
-        """
+        """`(n,)` heights y in metres of the first surface straight below `(n, 3)` points; NaN where there is none."""
         points = np.asarray(points, dtype=np.float64)
         rays = np.concatenate([points, np.broadcast_to([0.0, -1.0, 0.0], points.shape)], axis=1).astype(np.float32)
         distance = self._rays.cast(rays)["t_hit"].astype(np.float64)

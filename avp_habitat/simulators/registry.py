@@ -1,6 +1,5 @@
 """The simulators by name, made once per scene and process."""
 
-import gc
 import inspect
 import os
 import weakref
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from avp_habitat import plugins
-from avp_habitat.errors import SimulatorError, UsageError
+from avp_habitat.errors import UsageError
 from avp_habitat.scenes.location import UPS
 from avp_habitat.simulators.base import ASKED, Simulator
 
@@ -151,9 +150,7 @@ def open_simulator(choice: SimulatorChoice, scene: str | Path) -> Simulator:
     # Not where a link leads: what a file refers to lies beside the link.
     key = (choice, os.path.abspath(path), path.stat().st_mtime) if path.is_file() else (choice, scene, 0.0)
     simulator = _shared.get(key)
-    if simulator is None or _is_closed(simulator):
-        if choice.one_per_process:
-            _check_alone(choice, scene)
+    if simulator is None or getattr(simulator, "closed", False):
         simulator = _shared[key] = _opened(choice, scene)
     return simulator
 
@@ -172,26 +169,3 @@ def _opened(choice: SimulatorChoice, scene: str) -> Simulator:
     if missing := [each for each in ASKED if each not in dir(simulator)]:
         raise UsageError(f"simulator {choice.name!r}: {type(simulator).__name__} has no {', '.join(missing)}")
     return simulator
-
-
-def _check_alone(choice: SimulatorChoice, scene: str) -> None:
-    """Refuse a second simulator before it is made, where a process can hold one only."""
-    if not _open_already(choice):
-        return
-    gc.collect()  # An environment that nobody uses any more may be left in a circle of references.
-    if found := _open_already(choice):
-        raise SimulatorError(
-            f"{choice.name}: a process can hold one simulator, and this one has {found[0]} open already, so that "
-            f'{scene} needs a process of its own: SubprocVecEnv(start_method="forkserver"), or '
-            'avp_sb3.AVPSubprocVecEnv for several scenes; simulator="raycast" has no such limit'
-        )
-
-
-def _open_already(choice: SimulatorChoice) -> list[str]:
-    opened = [simulator for (other, _, _), simulator in list(_shared.items()) if other.simulator == choice.simulator]
-    return [simulator.scene for simulator in opened if not _is_closed(simulator)]
-
-
-def _is_closed(simulator: Simulator) -> bool:
-    """Whether somebody closed it before its last user was done."""
-    return getattr(simulator, "closed", False)

@@ -79,22 +79,22 @@ MISTAKES = [
     (
         "--scene room.glb --navmesh empty.navmesh",
         1,
-        r"empty\.navmesh: expected a NavMesh .*, but it ends after 0 bytes",
+        r"empty\.navmesh: expected a NavMesh .*, but it ends after 0 bytes.*",
     ),
     (
         "--scene room.glb --navmesh noise.navmesh",
         1,
-        r"noise\.navmesh: expected a NavMesh .*, but it does not begin as one",
+        r"noise\.navmesh: expected a NavMesh .*, but it does not begin as one.*",
     ),
     (
         "--scene room.glb --navmesh room.glb",
         1,
-        r"room\.glb: expected a NavMesh .*, but it does not begin as one",
+        r"room\.glb: expected a NavMesh .*, but it does not begin as one.*",
     ),
     (
         "--scene room.glb --simulator raycast --navmesh noise.navmesh",
         1,
-        r"noise\.navmesh: expected a NavMesh .*, but it does not begin as one",
+        r"noise\.navmesh: expected a NavMesh .*, but it does not begin as one.*",
     ),
     ("--scene room.glb --simulator raycast --gpu 0", 2, r"--gpu: is of the simulator 'habitat', but 'raycast' was .*"),
     ("--scene room.glb --simulator habitt", 2, r"unknown simulator 'habitt': .*; did you mean 'habitat'\?"),

@@ -116,7 +116,7 @@ def test_a_missing_cuda_device_is_an_error_of_ours(run):
 def test_egl_that_cannot_be_loaded_is_an_error_of_ours(run, tmp_path):
     (tmp_path / "libEGL.so.1").write_text("not a library")
     done = run(GUARDED, command("HabitatSimulator(room)"), LD_LIBRARY_PATH=str(tmp_path))
-    expect_error(done, "libEGL.so.1 cannot be loaded; Debian, Ubuntu: apt-get install libegl1")
+    expect_error(done, "Debian, Ubuntu: apt-get install libegl1")
 
 
 def test_egl_without_a_driver_is_an_error_of_ours(run, tmp_path):
@@ -225,7 +225,7 @@ def test_a_second_simulator_is_an_error_of_ours(run):
         GUARDED,
         command("first = HabitatSimulator(room)\ntry:\n    HabitatSimulator('builtin:0')\nfinally:\n    look(first)"),
     )
-    expect_error(done, "already has a simulator, on room.glb, so builtin:0 cannot be opened")
+    expect_error(done, "one simulator, and this one has room.glb open already, so that builtin:0 needs a process")
     assert "SubprocVecEnv" in done.stderr
     assert "sees" in done.stdout
     # Two of 0.3.4 do open and render, until the first is closed: it takes the graphics of both along.
@@ -245,8 +245,8 @@ def test_a_forked_process_gets_an_error_of_ours_and_its_parent_goes_on(run):
     done = run(GUARDED, command(code))
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("sees") == 2
-    assert "child: habitat: room.glb cannot be used here: this process was forked from process" in done.stdout
-    assert "error: habitat: builtin:0 cannot be used here: this process was forked from process" in done.stderr
+    assert "child: habitat: room.glb cannot be used here: a simulator was opened in another" in done.stdout
+    assert "error: habitat: builtin:0 cannot be used here: a simulator was opened in another" in done.stderr
 
 
 def test_a_forked_process_dies_or_hangs_without_our_guard(run):
@@ -293,20 +293,6 @@ def test_torch_and_triton_live_with_the_simulator(run, order):
     done = run(GUARDED, command(code))
     assert done.returncode == 0, done.stderr
     assert "sees" in done.stdout
-
-
-def test_triton_after_the_simulator_dies_without_our_guard(run):
-    pytest.importorskip("triton")
-    # The guard loads triton's library before the graphics; the engine alone does not.
-    done = run(PLAIN, "engine = plain()\nlook(engine)\nimport triton._C.libtriton\nprint('survived')")
-    expect_death(done, "", -signal.SIGSEGV, -signal.SIGABRT)
-
-
-def test_triton_between_habitat_sim_and_the_simulator_is_an_error_of_ours(run):
-    pytest.importorskip("triton")
-    code = "import magnum, habitat_sim, triton._C.libtriton\n"
-    expect_error(run(GUARDED, command(code + "HabitatSimulator(room)")), "triton (part of torch) was imported after")
-    expect_death(run(PLAIN, code + "look(plain()); print('survived')"), "", -signal.SIGSEGV, -signal.SIGABRT)
 
 
 # --- the end of the process -------------------------------------------------------------------------------------------

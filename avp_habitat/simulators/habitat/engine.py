@@ -6,10 +6,12 @@ What differs between them: sensors belong to the simulator from 0.3.4 on (`Simul
 """
 
 import errno
+import importlib
 import math
 import os
-import subprocess
+import platform
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
@@ -23,49 +25,25 @@ from avp_habitat.errors import SceneError, SimulatorError
 from avp_habitat.navigation.settings import NavigationSettings
 from avp_habitat.poses import Intrinsics
 from avp_habitat.simulators.base import Frames
-from avp_habitat.simulators.habitat.installed import cannot_load, require_installed
+from avp_habitat.simulators.habitat.installed import require_installed
 from avp_habitat.simulators.habitat.stage import NO_IMAGE, flat_mediator
 
-_TIME_LIMIT_S = 1.0
-# A process of its own: what Habitat-Sim says last has to be seen when it ends this one.
-_FILTER = """
-import signal, sys
-signal.signal(signal.SIGINT, signal.SIG_IGN)
-words = [word.encode() for word in sys.argv[1:]]
-for line in sys.stdin.buffer:
-    if not any(word in line for word in words):
-        sys.stdout.buffer.write(line)
-        sys.stdout.buffer.flush()
-"""
+_NO_NAVMESH = ("Could not build Detour navmesh", "Failed to build navmesh")
 
 
 @contextmanager
 def quiet_stderr(*words: str) -> Iterator[None]:
-    """Within the block, lines that hold one of these words are left out of stderr, also those that C++ writes."""
+    """Lines that hold one of these words are left out of stderr, also those that C++ writes; the others come late."""
     sys.stderr.flush()
-    kept = os.dup(2)
-    line = [sys.executable, "-I", "-S", "-c", _FILTER, *words]
-    try:
-        passing = subprocess.Popen(line, stdin=subprocess.PIPE, stdout=kept)
-    except OSError:  # Then there are some lines more.
-        os.close(kept)
-        yield
-        return
-    assert passing.stdin is not None
-    os.dup2(passing.stdin.fileno(), 2)
-    passing.stdin.close()
-    try:
-        yield
-    finally:
-        sys.stderr.flush()
-        os.dup2(kept, 2)
-        os.close(kept)
-        # A program that another thread has started meanwhile writes there too, and may go on for long.
-        with suppress(subprocess.TimeoutExpired):
-            passing.wait(_TIME_LIMIT_S)
-
-
-_NO_NAVMESH = ("Could not build Detour navmesh", "Failed to build navmesh")
+    with tempfile.TemporaryFile() as said, os.fdopen(os.dup(2), "wb") as kept:
+        os.dup2(said.fileno(), 2)
+        try:
+            yield
+        finally:
+            sys.stderr.flush()
+            os.dup2(kept.fileno(), 2)
+            said.seek(0)
+            kept.writelines(line for line in said if not any(word.encode() in line for word in words))
 
 
 @dataclass(frozen=True)
@@ -97,7 +75,7 @@ class HabitatEngine:
             gpu: CUDA device that renders, -1 for EGL's default; one that is not there ends the process.
 
         Raises:
-            SimulatorError: habitat-sim is missing or cannot be loaded.
+            SimulatorError: habitat-sim cannot be loaded.
             SceneError: Habitat-Sim cannot read the scene; the text is its own.
         """
         self._habitat = _import_habitat()
@@ -283,14 +261,27 @@ def _last_line(error: Exception) -> str:
 
 
 def _import_habitat() -> Any:
+    """The module, after triton where that is installed.
+
+    Triton (which torch brings along and `torch._dynamo` imports) and Mesa each carry an LLVM: loaded after a simulator,
+    or after corrade has switched Python to RTLD_GLOBAL, triton ends the process (habitat-sim 0.3.4, triton 3.9.0, Mesa
+    22.3.6). Loaded first, both run. Its extension is enough: 0.2 s; torch itself (2 to 5 s) is left alone.
+    """
     os.environ.setdefault("MAGNUM_LOG", "quiet")
     os.environ.setdefault("HABITAT_SIM_LOG", "quiet")
     flags = sys.getdlopenflags()
+    sys.setdlopenflags(flags & ~os.RTLD_GLOBAL)
     try:
+        with suppress(ImportError):
+            importlib.import_module("triton._C.libtriton")
         import magnum  # noqa: F401 # pyright: ignore[reportMissingImports] - has to come before habitat_sim
         import habitat_sim  # isort: skip # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise SimulatorError(cannot_load(error)) from error
+        raise SimulatorError(
+            f"habitat-sim is installed but cannot be loaded: {' '.join(str(error).split())}; it has to be built for "
+            f"Python {platform.python_version()} and NumPy {np.__version__}, and needs the packages and libraries that "
+            "it names (Debian, Ubuntu: apt-get install libegl1 libopengl0 libgl1)"
+        ) from error
     finally:
         # corrade leaves RTLD_GLOBAL on, with which the symbols of all that is imported later meet Mesa's.
         sys.setdlopenflags(flags)

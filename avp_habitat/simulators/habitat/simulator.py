@@ -1,8 +1,12 @@
 """Habitat-Sim as a simulator of the suite: its renderer and its NavMesh, on the CPU or a GPU."""
 
+import gc
+import os
 import tempfile
+import threading
 import weakref
 from dataclasses import astuple
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +21,6 @@ from avp_habitat.scenes.loader import identify
 from avp_habitat.scenes.location import Frame, SceneLocation, locate
 from avp_habitat.sight.rules import visible_in_depth
 from avp_habitat.simulators.base import Frames
-from avp_habitat.simulators.habitat import process
 from avp_habitat.simulators.habitat.engine import HabitatEngine, OverheadCamera
 from avp_habitat.simulators.habitat.graphics import choose_gpu
 from avp_habitat.simulators.habitat.installed import require_installed
@@ -37,10 +40,7 @@ def navmesh_area(engine: HabitatEngine, navmesh: Path | None) -> NavigableArea:
     Raises:
         SceneError: there is no floor, or the file is no NavMesh of this scene.
     """
-
-    def below(points: Float) -> NDArray[np.floating]:
-        return surface_below(engine, points)
-
+    below = partial(surface_below, engine)
     engine.recompute_navmesh(NavigationSettings())
     own = area_of_islands(engine.islands(), below, engine.bounds())
     return own if navmesh is None else area_of_file(navmesh, own, below, engine.bounds())
@@ -112,8 +112,7 @@ class HabitatSimulator:
         caught here before it happens.
 
         Args:
-            scene: a mesh file, a folder of Replica, a stage config, `NAME.scene_dataset_config.json:ID`, or
-                `builtin:SEED`; see `avp_habitat.scenes.location.locate`.
+            scene: as `avp_habitat.scenes.location.locate` takes it.
             gpu: CUDA device that renders; -1 for none; None for the first one that EGL offers, if any.
             navmesh: a `.navmesh` file; without it the NavMesh is computed for the design's agent.
             up: axis of a mesh file that points up, `y` or `z`.
@@ -152,7 +151,7 @@ class HabitatSimulator:
 
     def render(self, camera_to_world: NDArray[np.floating], intrinsics: Intrinsics, *, rgb: bool) -> Frames:
         """Depth, and colour when asked for, of `(n, 4, 4)` habitat poses; see `simulators.base.Simulator.render`."""
-        process.check_process(self.scene)
+        _check_process(self.scene)
         if self.closed:
             raise SimulatorError(f"habitat: the simulator of {self.scene} was closed; open the scene again")
         return self._engine.render(camera_to_world, intrinsics, rgb=rgb)
@@ -190,7 +189,7 @@ class HabitatSimulator:
         Returns:
             `(n, 3)` metres, at the NavMesh's heights.
         """
-        process.check_process(self.scene)
+        _check_process(self.scene)
         ends = np.asarray(positions) + displacements
         return np.stack([self._engine.try_step(*step) for step in zip(positions, ends, strict=True)])
 
@@ -213,20 +212,69 @@ def _finer(camera: Intrinsics) -> Intrinsics:
     return Intrinsics(*(times * value for value in astuple(camera)))
 
 
+_ONE_EACH = 'SubprocVecEnv(start_method="forkserver"), or avp_sb3.AVPSubprocVecEnv for several scenes'
+
+
+class _Process:
+    """What this process, or the one it was forked from, has done.
+
+    Habitat-Sim's graphics context is one per process and belongs to the thread that made it; a forked child inherits
+    it without the driver's threads and locks. Seen with habitat-sim 0.3.4 on Mesa 22.3.6: rendering in a forked child
+    never returns, opening a simulator there is a SIGABRT, and so is rendering in another thread.
+    """
+
+    opener: int | None = None
+    """Process id of the first that opened a simulator; a forked child inherits it."""
+    thread: int | None = None
+    """Thread that opened the simulator that is open."""
+    scene: str | None = None
+    """Scene of the simulator that is open."""
+
+
+def _check_process(scene: str) -> None:
+    """Refuse to use a simulator in a fork of the process that opened one, or in another thread."""
+    if _Process.opener in (None, os.getpid()) and _Process.thread in (None, threading.get_ident()):
+        return
+    raise SimulatorError(
+        f"habitat: {scene} cannot be used here: a simulator was opened in another thread, or before this process was "
+        f"forked from process {_Process.opener}, and its graphics work there alone; start workers before the first "
+        f"simulator, or use {_ONE_EACH}"
+    )
+
+
+def _claim(scene: str) -> None:
+    """Take this process's one place for a simulator."""
+    _check_process(scene)
+    if _Process.scene is not None:
+        gc.collect()  # An environment that nobody uses any more may be left in a circle of references.
+    if _Process.scene is not None:
+        raise SimulatorError(
+            f"habitat: a process can hold one simulator, and this one has {_Process.scene} open already, so that "
+            f'{scene} needs a process of its own: {_ONE_EACH}; simulator="raycast" has no such limit'
+        )
+    _Process.opener, _Process.thread, _Process.scene = os.getpid(), threading.get_ident(), scene
+
+
+def _release() -> bool:
+    """Give the place back; False in a forked child, which must leave alone what its parent still uses."""
+    if _Process.opener != os.getpid():
+        return False
+    _Process.thread = _Process.scene = None
+    return True
+
+
 def _open(location: SceneLocation, frame: Frame, gpu: int) -> HabitatEngine:
-    process.claim(location.name)
+    _claim(location.name)
     try:
-        process.import_before_graphics()
         with tempfile.TemporaryDirectory(prefix="avp-habitat-") as folder:
             return HabitatEngine(*write_stage(location, frame, Path(folder)), gpu=gpu)
     except BaseException:
-        process.release()
+        _release()
         raise
 
 
 def _close(engine: HabitatEngine) -> None:
-    # A forked child inherits the object, but must leave alone what its parent still uses.
-    if process.release():
+    if _release():
         engine.close()
 
 
