@@ -30,7 +30,6 @@ class Cell:
     """One piece of the experiment, done by one command."""
 
     kind: str
-    """`TRAIN`, `COLLECT` or `RECONSTRUCT`."""
     name: str
     """Unique within its kind."""
     words: tuple[str, ...]
@@ -106,11 +105,10 @@ class _Planner:
 
     def rollout(self, method: Method, seed: int, scene: ExperimentScene, start: int, training: Cell | None) -> Cell:
         preset, (width, height) = self.configuration.preset, self.configuration.preset.size
-        policy = (
-            ["--policy", str(training.output(self.root)), "--stochastic"] if training else ["--policy", method.spec]
-        )
+        policy = (str(training.output(self.root)), "--stochastic") if training else (method.spec,)
         name = f"{method.name}-{scene_slug(scene.name)}-{seed}-{start}"
-        words = ["python", "-m", "avp_habitat.collect", "--scene", scene.spec, *policy, "--reward", method.reward]
+        words = ["python", "-m", "avp_habitat.collect", "--scene", scene.spec, "--policy", *policy]
+        words += ["--reward", method.reward]
         # Every method starts at the same places.
         words += ["--seed", str(_START_SEEDS * (1 + start) + seed), "--budget", str(preset.budget)]
         words += ["--width", str(width), "--height", str(height), *self.configuration.simulator_options]
@@ -122,8 +120,8 @@ class _Planner:
         preset, of = self.configuration.preset, rollout
         name = of.name if frames is None else f"{of.name}-first_{frames}"
         words = ["python", "-m", "avp_nerfstudio.reconstruct", str(of.output(self.root))]
-        words += ["--out", self._out(RECONSTRUCT, name)]
-        words += ["--method", preset.reconstruction, "--iterations", str(preset.iterations)]
+        words += ["--out", self._out(RECONSTRUCT, name), "--method", preset.reconstruction]
+        words += ["--iterations", str(preset.iterations)]
         words += ["--frames", str(frames)] if frames is not None else []
         if frames is None and of.seed == 0 and of.start == 0:
             words += ["--pictures", *map(str, preset.heldout_pictures)]
@@ -144,28 +142,19 @@ def facts_of(cell: Cell, root: Path) -> dict[str, Any]:
 
 
 def _of_training(path: Path) -> dict[str, Any]:
+    """The metrics' curves are `[step, value]` points; empty where MLflow has not got the run yet."""
     from mlflow import MlflowClient
 
     from avp_habitat.policies.registry import load_model
+    from avp_habitat.tracking.experiments import find_run
 
     model = load_model(path)
-    run_id = getattr(model, "avp_mlflow_run_id", None)
-    curves = _curves(MlflowClient(os.environ["MLFLOW_TRACKING_URI"]), run_id) if run_id else {}
-    return {"steps": model.num_timesteps, "run_id": run_id, "curves": curves}
-
-
-def _curves(client: Any, run_id: str) -> dict[str, list[list[float]]]:
-    """`[step, value]` points by metric; empty where MLflow has not got the run yet."""
-    from mlflow.exceptions import MlflowException
-
-    curves = {}
-    for metric in _CURVES:
-        try:
-            found = {point.step: point.value for point in client.get_metric_history(run_id, metric)}
-        except MlflowException:
-            continue
+    client, run_id = MlflowClient(os.environ["MLFLOW_TRACKING_URI"]), getattr(model, "avp_mlflow_run_id", None)
+    run, curves = find_run(client, run_id), {}
+    for metric in _CURVES if run else ():
+        found = {point.step: point.value for point in client.get_metric_history(run.info.run_id, metric)}
         curves[metric] = [[step, round(found[step], 6)] for step in sorted(found)]
-    return curves
+    return {"steps": model.num_timesteps, "run_id": run_id, "curves": curves}
 
 
 def _of_rollout(folder: Path) -> dict[str, Any]:

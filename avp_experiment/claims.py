@@ -7,8 +7,7 @@ import numpy as np
 from avp_experiment import statistics
 from avp_experiment.configuration import ROOMS, TRAIN, UNSEEN
 from avp_experiment.results import Key, Results
-from avp_experiment.statistics import PREDICTORS, Summary
-from avp_experiment.tables import NOTHING
+from avp_experiment.statistics import NOTHING, PREDICTORS, Summary
 from avp_habitat.metrics import FIGURES
 from avp_habitat.tables import table
 

@@ -1,5 +1,6 @@
 """What an experiment consists of: methods, scenes, and a preset for each kind of machine and purpose."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,9 +25,9 @@ class Method:
     spec: str
     """The policy or reward: its name or `module:object`."""
     learned: bool = False
-    """Whether it is a reward."""
+    """It is a reward."""
     in_rooms: bool = False
-    """Whether it is trained in generated rooms, never in the scenes of the experiment."""
+    """Trained in generated rooms, never in the scenes of the experiment."""
 
     @property
     def name(self) -> str:
@@ -59,9 +60,7 @@ DEFAULT = (*BASELINES, *REWARDS, f"proposed{ROOMS}", f"surface{ROOMS}")
 def chosen_methods(names: Sequence[str]) -> tuple[Method, ...]:
     """The methods of these names, each once: known ones in their order, then those of the form `module:object`.
 
-    Args:
-        names: known ones, or `module:object` of a class or object with `predict`, or else of a reward; a reward's may
-            end in `_rooms`.
+    That is a class or object with `predict`, or else a reward, whose name may end in `_rooms`.
 
     Raises:
         UsageError: no such method, with the nearest name, or none at all.
@@ -72,14 +71,12 @@ def chosen_methods(names: Sequence[str]) -> tuple[Method, ...]:
     for name in names:
         if ":" not in name and name not in known:
             raise unknown_name("method", name, known)
-    placed = [_placed(name) for name in dict.fromkeys(names) if ":" in name]
-    return (*(method for name, method in known.items() if name in names), *placed)
-
-
-def _placed(name: str) -> Method:
-    spec = name.removesuffix(ROOMS)
-    learned = not hasattr(plugins.find("avp.policies", spec, {}), "predict")
-    return Method(spec, learned, in_rooms=learned and name != spec)
+    chosen = [method for name, method in known.items() if name in names]
+    for name in dict.fromkeys(name for name in names if ":" in name):
+        spec = name.removesuffix(ROOMS)
+        learned = not hasattr(plugins.find("avp.policies", spec, {}), "predict")
+        chosen.append(Method(spec, learned, in_rooms=learned and name != spec))
+    return tuple(chosen)
 
 
 @dataclass(frozen=True)
@@ -125,12 +122,10 @@ hours on two cores. gpu: the same questions at full size. paper: the paper's obs
 
 @dataclass(frozen=True)
 class ExperimentScene:
-    """A scene of the experiment."""
+    """A scene: as the user named it, and its name without folders."""
 
     spec: str
-    """As the user named it."""
     name: str
-    """Without folders."""
     sha256: str
     role: str
     """`TRAIN` or `UNSEEN`."""
@@ -161,8 +156,8 @@ class Configuration:
     def rooms(self) -> tuple[str, ...]:
         """The generated rooms of the methods that train in such, none of them a scene of the experiment."""
         taken = {scene.name for scene in self.scenes}
-        seeds = range(_FIRST_ROOM, _FIRST_ROOM + self.preset.rooms + len(taken))
-        return tuple([room for seed in seeds if (room := f"builtin:{seed}") not in taken][: self.preset.rooms])
+        rooms = (f"builtin:{seed}" for seed in itertools.count(_FIRST_ROOM))
+        return tuple(itertools.islice((room for room in rooms if room not in taken), self.preset.rooms))
 
     @property
     def simulator_options(self) -> tuple[str, ...]:
@@ -197,10 +192,8 @@ def read_scenes(train: Sequence[str], unseen: Sequence[str], choice: SimulatorCh
             scene = ExperimentScene(spec, opened.scene, opened.scene_digest, role)
             opened.close()
             for other in found:
-                if scene.sha256 == other.sha256:
-                    same = f"the same scene as {other.spec}, given as {other.role}; expected each scene once"
-                    raise UsageError(f"{spec}: {same}")
-                if scene_slug(scene.name) == scene_slug(other.name):
-                    raise UsageError(f"{spec}: has the same name as {other.spec}; expected scenes of different names")
+                if scene.sha256 == other.sha256 or scene_slug(scene.name) == scene_slug(other.name):
+                    same = "the same scene as" if scene.sha256 == other.sha256 else "named as"
+                    raise UsageError(f"{spec}: {same} {other.spec}, given as {other.role}; expected each name once")
             found.append(scene)
     return tuple(found)

@@ -4,9 +4,10 @@ import base64
 import json
 import os
 import platform
+import re
 import shutil
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,9 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_experiment.cells import COLLECT, RECONSTRUCT, Cell, floor_map
-from avp_experiment.cells import TRAIN as TRAINING
-from avp_experiment.configuration import TRAIN, UNSEEN, Configuration, scene_slug
+from avp_experiment.cells import COLLECT, RECONSTRUCT, TRAIN, Cell, floor_map
+from avp_experiment.configuration import Configuration, scene_slug
 from avp_experiment.folder import Folder, write_json
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.metrics import FIGURES, Figure, figures
@@ -25,8 +25,7 @@ from avp_habitat.provenance import PACKAGES, installed_versions
 
 FORMAT = 1
 FILE, PICTURES = "results.json", "pictures"
-CELLS = {"training": TRAINING, "rollouts": COLLECT, "reconstructions": RECONSTRUCT}
-"""Kinds of cells by their keys in the file."""
+_KINDS = {"training": TRAIN, "rollouts": COLLECT, "reconstructions": RECONSTRUCT}
 Key = tuple[str, int, int]
 """Scene, seed and start: what two methods have in common."""
 
@@ -39,7 +38,6 @@ class _Measured:
     role: str
     """Of its scene: train or unseen."""
     key: Key
-    """Scene, seed and start."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +45,9 @@ class EpisodeResult(_Measured):
     """One rollout."""
 
     metrics: Mapping[str, float]
-    """Figures of the whole episode; shares within [0, 1]."""
+    """Of the whole episode."""
     coverage_curve: tuple[float, ...]
-    """Coverage after each view, within [0, 1]."""
+    """After each view, within [0, 1]."""
     floor: Mapping[str, Any] | None
     """Its map (`floor_map`), kept of the first episode only."""
 
@@ -59,13 +57,11 @@ class Reconstruction(_Measured):
     """One reconstruction of an episode's first frames, or of all of them."""
 
     frames: int
-    """How many frames it was made of."""
     whole: bool
-    """Whether those are all of the episode."""
+    """Those are all of the episode."""
     scores: Mapping[str, float]
     """`psnr` in dB, `ssim`, `lpips`, as far as they could be computed: means over the held-out views."""
     lpips_reason: str | None
-    """Why there is no LPIPS."""
     visibility: float | None
     """Share of the held-out pixels that its frames have seen."""
     psnr_by_view: tuple[float | None, ...]
@@ -156,29 +152,26 @@ def read_results(folder: Path) -> Results:
         raise UsageError(f"{folder}: expected the folder of an experiment (with {FILE}), found none")
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise AVPError(f"{path}: expected JSON, could not read it: {error}") from None
-    if not isinstance(value, dict) or value.get("format") != FORMAT:
-        found = value.get("format") if isinstance(value, dict) else type(value).__name__
+    found = value.get("format") if isinstance(value, dict) else type(value).__name__
+    if found != FORMAT:
         raise AVPError(f"{path}: expected results of format {FORMAT}, found {found!r}")
-    # Results of before users could add figures.
-    value.setdefault("figures", {})
-    found = {name: _part(path, value, name, made_of) for name, made_of in _PARTS.items()}
-    return Results(folder, **found)
-
-
-def _part(path: Path, value: Mapping[str, Any], name: str, made_of: Callable[[Any], Any]) -> Any:
     try:
-        return made_of(value[name])
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise AVPError(f"{path}: {name}: missing or damaged: {error!r}") from None
-
-
-def _configuration(entry: Any) -> dict[str, Any]:
-    for scene in entry["scenes"]:
-        if scene["role"] not in (TRAIN, UNSEEN) or not isinstance(scene["name"], str):
-            raise ValueError(f"a scene without a name, or neither {TRAIN} nor {UNSEEN}: {scene}")
-    return dict(entry)
+        return Results(
+            folder=folder,
+            configuration=value["configuration"],
+            methods=tuple(value["methods"]),
+            # Results of before users could add figures have none.
+            figures={name: Figure(**entry) for name, entry in value.get("figures", {}).items()},
+            origin=value["origin"],
+            training=tuple(map(_training, value["training"])),
+            rollouts=tuple(map(_episode, value["rollouts"])),
+            reconstructions=tuple(map(_reconstruction, value["reconstructions"])),
+            failed=tuple(value["failed"]),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise AVPError(f"{path}: missing or damaged: {error!r}") from None
 
 
 def _training(entry: Any) -> Training:
@@ -187,7 +180,7 @@ def _training(entry: Any) -> Training:
 
 
 def _measured(entry: Any) -> tuple[str, str, Key]:
-    return entry["method"], entry["role"], (str(entry["scene"]), int(entry["seed"]), int(entry["start"]))
+    return entry["method"], entry["role"], (entry["scene"], entry["seed"], entry["start"])
 
 
 def _numbers(entry: Any) -> dict[str, float]:
@@ -214,20 +207,6 @@ def _reconstruction(entry: Any) -> Reconstruction:
     )
 
 
-_ORIGIN = ("command", "commits", "machine", "versions", "finished", "hours")
-_PARTS: dict[str, Callable[[Any], Any]] = {
-    "configuration": _configuration,
-    "methods": tuple,
-    "figures": lambda entries: {name: Figure(**entry) for name, entry in entries.items()},
-    "origin": lambda entry: {name: entry[name] for name in _ORIGIN},
-    "training": lambda entries: tuple(map(_training, entries)),
-    "rollouts": lambda entries: tuple(map(_episode, entries)),
-    "reconstructions": lambda entries: tuple(map(_reconstruction, entries)),
-    "failed": lambda entries: tuple({name: one[name] for name in ("cell", "reason", "log")} for one in entries),
-}
-"""What each part of the file becomes."""
-
-
 def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], *, command: str) -> dict[str, Any]:
     """Write `results.json` (docs/experiment.md describes it) of what is done by now, with pictures; its content."""
     done = [(cell, record) for cell in cells if (record := folder.record(cell)) is not None]
@@ -246,7 +225,7 @@ def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], 
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
             "hours": round(sum(record["seconds"] for _, record in done) / 3600, 2),
         },
-        **{part: [_entry(cell, folder) for cell, _ in done if cell.kind == kind] for part, kind in CELLS.items()},
+        **{part: [_entry(cell, folder) for cell, _ in done if cell.kind == kind] for part, kind in _KINDS.items()},
         "failed": [
             {"cell": cell.key, "reason": reason, "log": str(folder.log(cell).relative_to(folder.root))}
             for cell in cells
@@ -262,12 +241,11 @@ def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], 
 def _machine() -> dict[str, Any]:
     import torch
 
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    # Python names no processor on most Linux systems.
+    name = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text(encoding="utf-8"))
     return {
         "platform": platform.platform(),
-        "processor": names[0] if names else platform.processor() or platform.machine(),
+        "processor": name[1] if name else platform.machine(),
         "cores": len(os.sched_getaffinity(0)),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }

@@ -125,10 +125,7 @@ def _stop(running: Sequence[Any]) -> None:
 
 def _last_lines(log: Path) -> str:
     """The error that a log ends with, else its last three lines that say something, as one."""
-    try:
-        text = log.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return "no log"
+    text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else "no log"
     said = [line.strip() for line in text.replace("\r", "\n").splitlines() if line.strip()]
     errors = [line for line in said if line.startswith("error: ")]
     return errors[-1].removeprefix("error: ") if errors else " | ".join(said[-3:])[-400:]
@@ -148,7 +145,6 @@ def execute(cell: Cell, words: Sequence[str], root: Path, variables: dict[str, s
         print(f"$ {cell.command}", flush=True)
         code = _run(words) or _finish(folder, cell, time.monotonic() - started)
         sys.stdout.flush()
-        sys.stderr.flush()
     sys.exit(code)
 
 
