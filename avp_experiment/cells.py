@@ -36,13 +36,12 @@ class Cell:
     """The command line, `python -m MODULE …`, which works alone too."""
     method: Method
     seed: int
-    """Of the training, and of the starts."""
     scene: ExperimentScene | None = None
     """None for a training."""
     start: int = 0
     """Number of the episode within its seed."""
     frames: int | None = None
-    """A reconstruction from the first so many frames; None from all."""
+    """The first so many, of a reconstruction; None: all."""
     needs: "Cell | None" = None
 
     @property
@@ -132,11 +131,7 @@ class _Planner:
 
 
 def facts_of(cell: Cell, root: Path) -> dict[str, Any]:
-    """What is kept of a cell whose command has succeeded.
-
-    Raises:
-        AVPError: what the command made cannot be used.
-    """
+    """What is kept of a cell whose command has succeeded; an `AVPError` where that cannot be used."""
     facts = {TRAIN: _of_training, COLLECT: _of_rollout, RECONSTRUCT: _of_reconstruction}
     return facts[cell.kind](cell.output(root))
 
@@ -150,10 +145,11 @@ def _of_training(path: Path) -> dict[str, Any]:
 
     model = load_model(path)
     client, run_id = MlflowClient(os.environ["MLFLOW_TRACKING_URI"]), getattr(model, "avp_mlflow_run_id", None)
-    run, curves = find_run(client, run_id), {}
-    for metric in _CURVES if run else ():
-        found = {point.step: point.value for point in client.get_metric_history(run.info.run_id, metric)}
-        curves[metric] = [[step, round(found[step], 6)] for step in sorted(found)]
+    curves = {}
+    if (run := find_run(client, run_id)) is not None:
+        for metric in _CURVES:
+            found = {point.step: point.value for point in client.get_metric_history(run.info.run_id, metric)}
+            curves[metric] = [[step, round(found[step], 6)] for step in sorted(found)]
     return {"steps": model.num_timesteps, "run_id": run_id, "curves": curves}
 
 
@@ -177,11 +173,7 @@ def _steps(folder: Path) -> list[dict[str, str]]:
 
 
 def floor_map(folder: Path) -> dict[str, Any] | None:
-    """The map of a rollout as `results.json` keeps it, with `[x, z, yaw]` after each step in metres and radians.
-
-    Returns:
-        None for a rollout that was written without its floor.
-    """
+    """A rollout's map as `results.json` keeps it, with `[x, z, yaw]` after each step in metres and radians, if any."""
     from avp_habitat.rollout.format import read_rollout
     from avp_habitat.rollout.images import read_numbers
 

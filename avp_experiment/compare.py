@@ -6,7 +6,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,9 +28,8 @@ from avp_habitat.tracking.run import NewRun, TrackedRun, join_run, start_run
 from avp_habitat.tracking.stores import DEFAULT_ADDRESS, connect
 
 AUTO, NONE = "auto", "none"
-EXPERIMENT = "avp-experiment"
-"""MLflow experiment outside of `mlflow run` where `MLFLOW_EXPERIMENT_NAME` names none."""
-KIND = "experiment"
+EXPERIMENT, KIND = "avp-experiment", "experiment"
+"""MLflow experiment outside of `mlflow run` where `MLFLOW_EXPERIMENT_NAME` names none; value of `avp.kind`."""
 _ARTIFACTS = ("*.md", "*.csv", "*.png", "results.json", "experiment.json")
 _SHOWN = ("views", "coverage", "annd_m", "ei", "path_length_m", "visibility", "collisions", "stopped")
 _METHODS = f"with commas between: policies, rewards, rewards with {ROOMS}, module:object; auto: {', '.join(DEFAULT)}"
@@ -62,12 +61,7 @@ class Compare:
     """Cells at a time; auto: one per core."""
 
     def configuration(self) -> Configuration:
-        """Everything that can be known to be wrong is refused here, before anything is written.
-
-        Raises:
-            UsageError: an option cannot be right.
-            AVPError: a scene cannot be used.
-        """
+        """Everything that can be known to be wrong is refused here, before anything is written."""
         if self.preset not in PRESETS:
             raise unknown_name("preset", self.preset, PRESETS)
         methods = chosen_methods(DEFAULT if self.methods == AUTO else _split(self.methods))
@@ -83,8 +77,7 @@ class Compare:
     @property
     def line(self) -> str:
         """The command line as a user types it."""
-        given = {field.name: getattr(self, field.name) for field in fields(self)}
-        chosen = {name: str(value) for name, value in given.items() if value != getattr(Compare, name)}
+        chosen = {name: str(value) for name, value in vars(self).items() if value != getattr(Compare, name)}
         if os.environ.get("MLFLOW_RUN_ID"):
             options = [f"-P {name}={shlex.quote(value)}" for name, value in chosen.items()]
             return " ".join(["mlflow run . -e compare --env-manager local", *options])
@@ -141,12 +134,7 @@ def compare(configuration: Configuration, out: Path, *, jobs: int, line: str) ->
 
 
 def open_parent(name: str) -> tuple[TrackedRun, str]:
-    """The run that `mlflow run` has begun, else a new one; and the MLflow experiment, in which trainings are made too.
-
-    Raises:
-        TrackingError: the store cannot be used.
-    """
-    # `mlflow run` sets it.
+    """The run that `mlflow run` has begun, else a new one; and the MLflow experiment, also that of the trainings."""
     address, begun = os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_ADDRESS, os.environ.get("MLFLOW_RUN_ID")
     if begun:
         client = connect(address)

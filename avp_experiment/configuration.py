@@ -51,8 +51,7 @@ def known_methods() -> dict[str, Method]:
 
 
 BASELINES = ("heuristic", "random", "frontier", "greedy", "oracle", "survey")
-"""What learned policies are compared with by default; the last two plan with full knowledge, for floor and for all
-surfaces."""
+"""What learned policies are compared with by default; the last two plan with full knowledge."""
 DEFAULT = (*BASELINES, *REWARDS, f"proposed{ROOMS}", f"surface{ROOMS}")
 """The baselines, every reward, and the rewards with a learned stop trained over many rooms."""
 
@@ -61,9 +60,6 @@ def chosen_methods(names: Sequence[str]) -> tuple[Method, ...]:
     """The methods of these names, each once: known ones in their order, then those of the form `module:object`.
 
     That is a class or object with `predict`, or else a reward, whose name may end in `_rooms`.
-
-    Raises:
-        UsageError: no such method, with the nearest name, or none at all.
     """
     if not names:
         raise UsageError("methods: expected at least one, got none")
@@ -94,13 +90,11 @@ class ExperimentPreset:
     observation: str = "map"
     """What the policies observe; `map` becomes what the reward `surface` needs for that reward."""
     rooms: int = 16
-    """How many generated rooms."""
     size: tuple[int, int] = (640, 480)
     """Width and height of the pictures in pixels."""
     reconstruction: str = "avp-nerfacto"
     """nerfstudio's method."""
     iterations: int = 30_000
-    """Of each reconstruction."""
     prefixes: tuple[int, ...] = (20, 40, 60)
     """Each episode is also reconstructed from its first so many frames."""
     budget: int = 80
@@ -132,7 +126,7 @@ class ExperimentScene:
 
 
 def scene_slug(name: str) -> str:
-    """A scene's name for files: `white_room.glb` becomes `white_room`, `builtin:0` becomes `builtin_0`."""
+    """A scene's name for files: `white_room` of `white_room.glb`, `builtin_0` of `builtin:0`."""
     return Path(name).stem.replace(":", "_")
 
 
@@ -147,7 +141,7 @@ class Configuration:
     """Of training first, then unseen ones."""
     methods: tuple[Method, ...]
     metrics: tuple[str, ...] = ()
-    """Further ones, of episodes and rollouts: `module:function` or what another distribution registers."""
+    """Of the user, by name or `module:function`."""
     simulator: str = "raycast"
     up: str | None = None
     """Axis of mesh files that points up; the scenes' digests cover it."""
@@ -161,7 +155,7 @@ class Configuration:
 
     @property
     def simulator_options(self) -> tuple[str, ...]:
-        """The options of commands that open a scene."""
+        """Of commands that open a scene."""
         return ("--simulator", self.simulator, *(("--up", self.up) if self.up else ()))
 
     def as_json(self) -> dict[str, Any]:
@@ -176,12 +170,7 @@ class Configuration:
 
 
 def read_scenes(train: Sequence[str], unseen: Sequence[str], choice: SimulatorChoice) -> tuple[ExperimentScene, ...]:
-    """Open every scene once, so that one that cannot be used is named before anything long begins.
-
-    Raises:
-        UsageError: no scene of training, one given twice, or a name that cannot be right.
-        AVPError: a scene cannot be read, or nobody can stand in it.
-    """
+    """Open every scene once, so that one that cannot be used is named before anything long begins."""
     if not train:
         raise UsageError("scene: expected at least one scene of training, got none")
     found: list[ExperimentScene] = []

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from avp_experiment.cells import RECONSTRUCT, TRAIN, Cell
+from avp_experiment.cells import TRAIN, Cell
 from avp_experiment.configuration import Configuration
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.files import atomic_file
@@ -44,7 +44,7 @@ class Folder:
 
     def is_empty(self, cell: Cell) -> bool:
         """Whether a rollout is so short that its first frames are all of it, which another cell reconstructs."""
-        if cell.kind != RECONSTRUCT or cell.frames is None or cell.needs is None:
+        if cell.frames is None or cell.needs is None:
             return False
         about = self.record(cell.needs)
         return about is not None and about["facts"]["metrics"]["views"] <= cell.frames

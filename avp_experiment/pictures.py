@@ -8,7 +8,7 @@ import numpy as np
 
 from avp_experiment.configuration import TRAIN, UNSEEN, scene_slug
 from avp_experiment.plots import WIDTH_IN, Drawn, Missing, new_figure
-from avp_experiment.results import PICTURES, EpisodeResult, Results, floor_of
+from avp_experiment.results import PICTURES, EpisodeResult, Results
 from avp_habitat.metrics import FIGURES
 from avp_habitat.poses import heading
 from avp_habitat.rollout.images import read_rgb
@@ -35,7 +35,7 @@ def maps(results: Results, methods: Sequence[str] = DEFAULT_MAPS) -> Drawn:
     shown = [method for method in methods if any((method, scene) in drawn for scene in scenes)]
     if not shown:
         raise Missing(f"no episode of {', '.join(methods)} has a map")
-    numbers = {which: floor_of(dict(one.floor or {})) for which, one in drawn.items() if which[0] in shown}
+    numbers = {which: one.floor["numbers"] for which, one in drawn.items() if one.floor and which[0] in shown}
     last = max(int(floor.max()) - 1 for floor in numbers.values())
     tallest = [max(np.divide(*floor.shape) for (_, of), floor in numbers.items() if of == scene) for scene in scenes]
     width_in = (WIDTH_IN - 1.2) / len(shown)
@@ -45,7 +45,7 @@ def maps(results: Results, methods: Sequence[str] = DEFAULT_MAPS) -> Drawn:
     for row, scene in zip(panels, scenes, strict=True):
         for axes, method in zip(row, shown, strict=True):
             if (method, scene) in drawn:
-                image = _draw_map(axes, drawn[method, scene], numbers[method, scene], last)
+                image = _draw_map(axes, drawn[method, scene], last)
             else:
                 axes.set_axis_off()
                 axes.set_title(f"{method}: no episode", fontsize=9)
@@ -91,14 +91,15 @@ def same_views(results: Results, role: str) -> Drawn:
     return Drawn(picture, caption + (f" Not shown: {left_out}." if left_out else ""))
 
 
-def _draw_map(axes: "Axes", rollout: EpisodeResult, numbers: np.ndarray, last: int) -> Any:
+def _draw_map(axes: "Axes", rollout: EpisodeResult, last: int) -> Any:
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
 
     # Without its lightest part, which on white cannot be told from what is no floor.
     shades = ListedColormap(colormaps["YlGnBu"](np.linspace(0.2, 1, 256)))
     assert rollout.floor is not None
-    cell, (x, z), (rows, columns) = (rollout.floor[name] for name in ("cell_m", "origin_m", "shape"))
+    numbers, cell, (x, z) = (rollout.floor[name] for name in ("numbers", "cell_m", "origin_m"))
+    rows, columns = numbers.shape
     extent = (x, x + columns * cell, z + rows * cell, z)
     base = np.ma.masked_where(numbers == NOT_NAVIGABLE, np.zeros(numbers.shape))
     axes.imshow(base, extent=extent, cmap=ListedColormap([_UNSEEN_COLOUR]), interpolation="nearest")

@@ -96,13 +96,11 @@ def reward_while_training(results: Results) -> Drawn:
     columns = min(3, len(trained))
     rows = -(-len(trained) // columns)
     picture = new_figure(0.4 + 2.4 * rows)
-    panels = list(np.ravel(picture.subplots(rows, columns, squeeze=False)))
-    for axes, (method, trainings) in zip(panels, trained.items(), strict=False):
+    for place, (method, trainings) in enumerate(trained.items()):
+        axes = picture.add_subplot(rows, columns, place + 1)
         _training_curve(axes, method, trainings, REWARD)
         axes.set_title(method, fontsize=10)
         axes.grid(alpha=0.3)
-    for axes in panels[len(trained) :]:
-        axes.set_axis_off()
     picture.supxlabel("environment steps while training [millions]", fontsize=10)
     picture.supylabel("mean reward of an episode", fontsize=10)
     return Drawn(
@@ -193,11 +191,11 @@ def _psnr_points(results: Results, method: str, role: str) -> list[tuple[float, 
     """Number of views, and PSNR by episode: of the first frames where all episodes have so many, and of all frames."""
     episodes = results.reconstruction_curves(method, role)
     scored = [(key, one) for key, curve in episodes.items() for one in curve.values() if "psnr" in one.scores]
-    first: dict[int, dict[Key, float]] = {}
-    for key, one in scored:
-        if not one.whole:
-            first.setdefault(one.frames, {})[key] = one.scores["psnr"]
-    points = [(float(views), first[views]) for views in sorted(first) if len(first[views]) == len(episodes)]
+    points = []
+    for views in sorted({one.frames for _, one in scored if not one.whole}):
+        first = {key: one.scores["psnr"] for key, one in scored if not one.whole and one.frames == views}
+        if len(first) == len(episodes):
+            points.append((float(views), first))
     if whole := {key: one for key, one in scored if one.whole}:
         views = float(np.mean([one.frames for one in whole.values()]))
         points.append((views, {key: one.scores["psnr"] for key, one in whole.items()}))

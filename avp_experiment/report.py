@@ -35,12 +35,7 @@ _SETTINGS = ("seeds", "starts", "budget", "observation", "steps", "steps_rooms",
 
 
 def write_report(folder: Path, *, shown_maps: Sequence[str] = DEFAULT_MAPS) -> Path:
-    """Write tables, figures (5 of some methods), claims and the page that holds them; gives the page.
-
-    Raises:
-        UsageError: no such folder.
-        AVPError: the results are damaged, or the folder cannot be written.
-    """
+    """Write tables, figures (5 of some methods), claims and the page that holds them; gives the page."""
     results = read_results(folder)
     parts = [(title, partial(_table, role=role), name) for name, (role, title) in _TABLES.items()]
     parts += [(title, partial(_figure, draw=draw), name) for name, (title, draw) in _figures(shown_maps).items()]
@@ -120,9 +115,8 @@ def _write_csv(path: Path, rows: Rows, shown: Sequence[Figure], episodes: Mappin
 
 
 def _notes(results: Results, role: str, found: Mapping[str, Mapping[str, Mapping[Key, float]]]) -> list[str]:
-    notes = []
-    if missing := [method for method in results.methods if method not in found]:
-        notes.append(f"No episode of {', '.join(missing)}.")
+    missing = [method for method in results.methods if method not in found]
+    notes = [f"No episode of {', '.join(missing)}."] if missing else []
     most = max(len(values["coverage"]) for values in found.values())
     fewer = [
         f"{method} {len(values['coverage'])} episodes, {len(values['psnr'])} reconstructions"
@@ -193,11 +187,10 @@ class ReportOptions:
 
 def main(options: ReportOptions) -> None:
     """Make the tables and figures again."""
-    if options.maps != DEFAULT_MAPS:
-        known = read_results(options.folder).methods
-        for name in options.maps:
-            if name not in known:
-                raise unknown_name("method of --maps", name, known)
+    known = (*read_results(options.folder).methods, *DEFAULT_MAPS)
+    for name in options.maps:
+        if name not in known:
+            raise unknown_name("method of --maps", name, known)
     print(f"report: {write_report(options.folder, shown_maps=options.maps)}")
 
 

@@ -49,7 +49,7 @@ class EpisodeResult(_Measured):
     coverage_curve: tuple[float, ...]
     """After each view, within [0, 1]."""
     floor: Mapping[str, Any] | None
-    """Its map (`floor_map`), kept of the first episode only."""
+    """Its map (`floor_map`) with its numbers, kept of the first episode only."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Reconstruction(_Measured):
 
     frames: int
     whole: bool
-    """Those are all of the episode."""
+    """Of all frames of the episode."""
     scores: Mapping[str, float]
     """`psnr` in dB, `ssim`, `lpips`, as far as they could be computed: means over the held-out views."""
     lpips_reason: str | None
@@ -115,38 +115,22 @@ class Results:
         return {key: figures[name] for key, figures in found.items() if name in figures}
 
     def reconstruction_curves(self, method: str, role: str) -> dict[Key, dict[int, Reconstruction]]:
-        """By episode: its reconstructions by their number of frames, in ascending order, none twice.
-
-        Only episodes that have more than one are there, unless no episode has.
-        """
+        """By episode its reconstructions by number of frames, ascending; of episodes that have several, if any has."""
         found: dict[Key, dict[int, Reconstruction]] = {}
         for one in sorted(self.reconstructions, key=lambda one: (one.frames, one.whole)):
             if (one.method, one.role) == (method, role):
                 found.setdefault(one.key, {})[one.frames] = one
-        several = {key: curve for key, curve in found.items() if len(curve) > 1}
-        return several or found
+        return {key: curve for key, curve in found.items() if len(curve) > 1} or found
 
 
 def floor_of(entry: Mapping[str, Any]) -> NDArray[np.uint16]:
-    """`(rows, columns)` numbers of a map, as its rollout's `floor.png` holds them.
-
-    Raises:
-        AVPError: the entry is damaged.
-    """
-    try:
-        packed = zlib.decompress(base64.b64decode(entry["floor"], validate=True))
-        return np.frombuffer(packed, dtype="<u2").reshape(entry["shape"]).astype(np.uint16)
-    except (KeyError, TypeError, ValueError, zlib.error) as error:
-        raise AVPError(f"a map of the results cannot be read: {error}") from None
+    """`(rows, columns)` numbers of a map, as its rollout's `floor.png` holds them."""
+    packed = zlib.decompress(base64.b64decode(entry["floor"], validate=True))
+    return np.frombuffer(packed, dtype="<u2").reshape(entry["shape"]).astype(np.uint16)
 
 
 def read_results(folder: Path) -> Results:
-    """Read the results in an experiment's folder.
-
-    Raises:
-        UsageError: there is no such folder, or no `results.json` in it.
-        AVPError: that file is damaged or of another format.
-    """
+    """Read the `results.json` of an experiment's folder; an `AVPError` where that is missing or damaged."""
     path = folder / FILE
     if not path.is_file():
         raise UsageError(f"{folder}: expected the folder of an experiment (with {FILE}), found none")
@@ -170,7 +154,7 @@ def read_results(folder: Path) -> Results:
             reconstructions=tuple(map(_reconstruction, value["reconstructions"])),
             failed=tuple(value["failed"]),
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
         raise AVPError(f"{path}: missing or damaged: {error!r}") from None
 
 
@@ -190,11 +174,11 @@ def _numbers(entry: Any) -> dict[str, float]:
 
 def _episode(entry: Any) -> EpisodeResult:
     curve = tuple(float(share) for share in entry["coverage_curve"])
-    return EpisodeResult(*_measured(entry), _numbers(entry["metrics"]), curve, entry.get("map"))
+    floor = entry.get("map") and {**entry["map"], "numbers": floor_of(entry["map"])}
+    return EpisodeResult(*_measured(entry), _numbers(entry["metrics"]), curve, floor)
 
 
 def _reconstruction(entry: Any) -> Reconstruction:
-    seen = entry.get("visibility")
     return Reconstruction(
         *_measured(entry),
         # An episode that stopped before has no more frames than it has.
@@ -202,7 +186,7 @@ def _reconstruction(entry: Any) -> Reconstruction:
         whole=bool(entry["whole"]),
         scores=_numbers(entry["scores"]),
         lpips_reason=entry.get("lpips_reason"),
-        visibility=None if seen is None else float(seen),
+        visibility=entry.get("visibility"),
         psnr_by_view=tuple(view.get("psnr") for view in entry["per_view"]),
     )
 
@@ -264,9 +248,7 @@ def _entry(cell: Cell, folder: Folder) -> dict[str, Any]:
 
 
 def _scored(cell: Cell, found: dict[str, Any], folder: Folder) -> dict[str, Any]:
-    assert cell.needs is not None
-    rollout = folder.record(cell.needs)
-    assert rollout is not None
+    rollout = (folder.record(cell.needs) if cell.needs else None) or {}
     views, seen = round(rollout["facts"]["metrics"]["views"]), found.get("visibility") or {}
     shares = seen.get("per_view") or [None] * len(found["per_view"])
     return {

@@ -104,8 +104,7 @@ def views_to_reach(curve: Mapping[int, float], target: float) -> float | None:
 def spearman(x: ArrayLike, y: ArrayLike, rollout: Sequence[object]) -> Correlation | None:
     """Spearman's ρ of `(n,)` and `(n,)`; its interval draws whole rollouts, `(n,)`, whose points are not independent.
 
-    Returns:
-        None for fewer than three points, or where one of the two does not vary.
+    None for fewer than three points, or where one of the two does not vary.
     """
     x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:

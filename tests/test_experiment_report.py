@@ -345,7 +345,7 @@ BAD = {
     "a damaged map": (
         lambda folder: spoiled(folder, lambda v: v["rollouts"][0]["map"].update(floor="####")),
         1,
-        "a map of the results cannot be read",
+        "results.json: missing or damaged",
     ),
 }
 
