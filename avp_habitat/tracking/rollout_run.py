@@ -67,7 +67,7 @@ def rollout_run(store: "MlflowClient | str", folder: str | Path, *, experiment: 
             if policy and policy.info.experiment_id == run.info.experiment_id and names.PARENT_TAG not in run.data.tags:
                 for tag in (names.PARENT_TAG, names.POLICY_RUN_TAG):
                     client.set_tag(run.info.run_id, tag, policy.info.run_id)
-    except (MlflowException, OSError) as error:
+    except (MlflowException, OSError, ValueError) as error:
         there = stores.shown(client.tracking_uri)
         text = f"MLflow at {there} did not take the rollout {rollout.folder}: {stores.first_line(error)}"
         raise stores.TrackingError(text) from error
