@@ -30,20 +30,18 @@ class Cell:
     """One piece of the experiment, done by one command."""
 
     kind: str
-    """`TRAIN`, `COLLECT` or `RECONSTRUCT`."""
     name: str
     """Unique within its kind."""
     words: tuple[str, ...]
     """The command line, `python -m MODULE …`, which works alone too."""
     method: Method
     seed: int
-    """Of the training, and of the starts."""
     scene: ExperimentScene | None = None
     """None for a training."""
     start: int = 0
     """Number of the episode within its seed."""
     frames: int | None = None
-    """A reconstruction from the first so many frames; None from all."""
+    """The first so many, of a reconstruction; None: all."""
     needs: "Cell | None" = None
 
     @property
@@ -106,11 +104,10 @@ class _Planner:
 
     def rollout(self, method: Method, seed: int, scene: ExperimentScene, start: int, training: Cell | None) -> Cell:
         preset, (width, height) = self.configuration.preset, self.configuration.preset.size
-        policy = (
-            ["--policy", str(training.output(self.root)), "--stochastic"] if training else ["--policy", method.spec]
-        )
+        policy = (str(training.output(self.root)), "--stochastic") if training else (method.spec,)
         name = f"{method.name}-{scene_slug(scene.name)}-{seed}-{start}"
-        words = ["python", "-m", "avp_habitat.collect", "--scene", scene.spec, *policy, "--reward", method.reward]
+        words = ["python", "-m", "avp_habitat.collect", "--scene", scene.spec, "--policy", *policy]
+        words += ["--reward", method.reward]
         # Every method starts at the same places.
         words += ["--seed", str(_START_SEEDS * (1 + start) + seed), "--budget", str(preset.budget)]
         words += ["--width", str(width), "--height", str(height), *self.configuration.simulator_options]
@@ -122,8 +119,8 @@ class _Planner:
         preset, of = self.configuration.preset, rollout
         name = of.name if frames is None else f"{of.name}-first_{frames}"
         words = ["python", "-m", "avp_nerfstudio.reconstruct", str(of.output(self.root))]
-        words += ["--out", self._out(RECONSTRUCT, name)]
-        words += ["--method", preset.reconstruction, "--iterations", str(preset.iterations)]
+        words += ["--out", self._out(RECONSTRUCT, name), "--method", preset.reconstruction]
+        words += ["--iterations", str(preset.iterations)]
         words += ["--frames", str(frames)] if frames is not None else []
         if frames is None and of.seed == 0 and of.start == 0:
             words += ["--pictures", *map(str, preset.heldout_pictures)]
@@ -134,38 +131,26 @@ class _Planner:
 
 
 def facts_of(cell: Cell, root: Path) -> dict[str, Any]:
-    """What is kept of a cell whose command has succeeded.
-
-    Raises:
-        AVPError: what the command made cannot be used.
-    """
+    """What is kept of a cell whose command has succeeded; an `AVPError` where that cannot be used."""
     facts = {TRAIN: _of_training, COLLECT: _of_rollout, RECONSTRUCT: _of_reconstruction}
     return facts[cell.kind](cell.output(root))
 
 
 def _of_training(path: Path) -> dict[str, Any]:
+    """The metrics' curves are `[step, value]` points; empty where MLflow has not got the run yet."""
     from mlflow import MlflowClient
 
     from avp_habitat.policies.registry import load_model
+    from avp_habitat.tracking.experiments import find_run
 
     model = load_model(path)
-    run_id = getattr(model, "avp_mlflow_run_id", None)
-    curves = _curves(MlflowClient(os.environ["MLFLOW_TRACKING_URI"]), run_id) if run_id else {}
-    return {"steps": model.num_timesteps, "run_id": run_id, "curves": curves}
-
-
-def _curves(client: Any, run_id: str) -> dict[str, list[list[float]]]:
-    """`[step, value]` points by metric; empty where MLflow has not got the run yet."""
-    from mlflow.exceptions import MlflowException
-
+    client, run_id = MlflowClient(os.environ["MLFLOW_TRACKING_URI"]), getattr(model, "avp_mlflow_run_id", None)
     curves = {}
-    for metric in _CURVES:
-        try:
-            found = {point.step: point.value for point in client.get_metric_history(run_id, metric)}
-        except MlflowException:
-            continue
-        curves[metric] = [[step, round(found[step], 6)] for step in sorted(found)]
-    return curves
+    if (run := find_run(client, run_id)) is not None:
+        for metric in _CURVES:
+            found = {point.step: point.value for point in client.get_metric_history(run.info.run_id, metric)}
+            curves[metric] = [[step, round(found[step], 6)] for step in sorted(found)]
+    return {"steps": model.num_timesteps, "run_id": run_id, "curves": curves}
 
 
 def _of_rollout(folder: Path) -> dict[str, Any]:
@@ -188,11 +173,7 @@ def _steps(folder: Path) -> list[dict[str, str]]:
 
 
 def floor_map(folder: Path) -> dict[str, Any] | None:
-    """The map of a rollout as `results.json` keeps it, with `[x, z, yaw]` after each step in metres and radians.
-
-    Returns:
-        None for a rollout that was written without its floor.
-    """
+    """A rollout's map as `results.json` keeps it, with `[x, z, yaw]` after each step in metres and radians, if any."""
     from avp_habitat.rollout.format import read_rollout
     from avp_habitat.rollout.images import read_numbers
 

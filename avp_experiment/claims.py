@@ -7,8 +7,7 @@ import numpy as np
 from avp_experiment import statistics
 from avp_experiment.configuration import ROOMS, TRAIN, UNSEEN
 from avp_experiment.results import Key, Results
-from avp_experiment.statistics import PREDICTORS, Summary
-from avp_experiment.tables import NOTHING
+from avp_experiment.statistics import NOTHING, PREDICTORS, Summary
 from avp_habitat.metrics import FIGURES
 from avp_habitat.tables import table
 
@@ -49,30 +48,24 @@ def _failures(results: Results) -> list[str]:
 def _heuristic(results: Results) -> list[str]:
     # By the trainings that are there; a training that failed has no episodes to compare.
     trained = {one.method for one in results.training}
-    names = ("coverage", "psnr")
-    lines = []
+    names, lines = ("coverage", "psnr"), []
     for role, where in _WHERE.items():
-        base = {name: results.values("heuristic", role, name) for name in names}
-        found = {
-            method: [statistics.paired(results.values(method, role, name), base[name]) for name in names]
-            for method in results.methods
-            if method in trained
-        }
-        found = {method: both for method, both in found.items() if any(both)}
+        found = {}
+        for method in results.methods:
+            pairs = [[results.values(one, role, name) for one in (method, "heuristic")] for name in names]
+            both = [statistics.paired(*pair) for pair in pairs]
+            if method in trained and any(both):
+                found[method] = both
         if not found:
             lines.append(f"{where.capitalize()}: nothing to compare (no episodes of `heuristic` and a learned policy).")
             continue
-        head = ["learned − heuristic", *map(_heading, names)]
         rows = [[method, *map(_difference, both, names)] for method, both in found.items()]
-        lines += [
-            f"{where.capitalize()} the heuristic is {_below(list(found.values()))}.",
-            table(head, rows, words=1),
-        ]
+        lines.append(f"{where.capitalize()} the heuristic is {_below(list(found.values()))}.")
+        lines.append(table(["learned − heuristic", *map(_heading, names)], rows, words=1))
     return lines
 
 
 def _below(found: Sequence[Sequence[Summary | None]]) -> str:
-    """How far below all learned policies the heuristic is."""
     differences = [one for both in found for one in both if one is not None]
     missing = "" if len(differences) == 2 * len(found) else ", as far as there are figures"
     both = "coverage and PSNR" if any(psnr for _, psnr in found) else "coverage"
@@ -86,9 +79,8 @@ def _below(found: Sequence[Sequence[Summary | None]]) -> str:
 def _fewer_views(results: Results) -> list[str]:
     lines = []
     for role, where in _WHERE.items():
-        views, psnr = (
-            [results.values(method, role, name) for method in ("proposed", "coverage")] for name in ("views", "psnr")
-        )
+        both = ("proposed", "coverage")
+        views, psnr = ([results.values(method, role, name) for method in both] for name in ("views", "psnr"))
         saved, difference, where = statistics.saved_share(*views), statistics.paired(*psnr), where.capitalize()
         if saved is None or difference is None:
             missing = "episodes" if saved is None else "reconstructions"
@@ -114,7 +106,6 @@ def _holds(saved: Summary, difference: Summary) -> str:
 
 
 def _surface_against_proposed(results: Results) -> list[str]:
-    """Paragraphs for each pair of methods and each kind of scenes."""
     lines = []
     for left, right in PAIRS:
         if not {left, right} <= set(results.methods):
@@ -140,10 +131,10 @@ def _compared(results: Results, left: str, right: str, role: str) -> list[str]:
         both = [{key: curve[views] for key, curve in curves.items()} for curves in (first, second)]
         rows.append([str(views), _difference(statistics.paired(*both), "psnr"), str(len(common))])
     shorter = {key: min(max(first[key]), max(second[key])) for key in common}
-    both = [
-        {key: psnr for key, curve in curves.items() if (psnr := statistics.at_views(curve, shorter[key])) is not None}
-        for curves in (first, second)
-    ]
+    both = []
+    for curves in (first, second):
+        at = {key: statistics.at_views(curve, shorter[key]) for key, curve in curves.items()}
+        both.append({key: psnr for key, psnr in at.items() if psnr is not None})
     difference = statistics.paired(*both)
     rows.append(["the shorter episode's", _difference(difference, "psnr"), str(len(set.intersection(*map(set, both))))])
     said = _equal_views(difference) if difference else "no common range of views."

@@ -4,9 +4,11 @@ import os
 import shlex
 import sys
 import time
-from dataclasses import dataclass, fields, replace
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import arg
 
@@ -17,11 +19,19 @@ from avp_experiment.runner import PRELOAD, Runner, environment
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError, unknown_name
 from avp_habitat.metrics import METRICS_HELP, find_metrics
+from avp_habitat.provenance import flat
 from avp_habitat.scenes.location import UP_HELP
 from avp_habitat.simulators.registry import SIMULATORS, SimulatorChoice
+from avp_habitat.tracking.experiments import NAME_VARIABLE, existing_run, find_run
+from avp_habitat.tracking.names import KIND_TAG, METHOD_TAG, PARENT_TAG, POLICY_TAG, SCENE_TAG
+from avp_habitat.tracking.run import NewRun, TrackedRun, join_run, start_run
+from avp_habitat.tracking.stores import DEFAULT_ADDRESS, connect
 
-AUTO = "auto"
-NONE = "none"
+AUTO, NONE = "auto", "none"
+EXPERIMENT, KIND = "avp-experiment", "experiment"
+"""MLflow experiment outside of `mlflow run` where `MLFLOW_EXPERIMENT_NAME` names none; value of `avp.kind`."""
+_ARTIFACTS = ("*.md", "*.csv", "*.png", "results.json", "experiment.json")
+_SHOWN = ("views", "coverage", "annd_m", "ei", "path_length_m", "visibility", "collisions", "stopped")
 _METHODS = f"with commas between: policies, rewards, rewards with {ROOMS}, module:object; auto: {', '.join(DEFAULT)}"
 
 
@@ -51,18 +61,13 @@ class Compare:
     """Cells at a time; auto: one per core."""
 
     def configuration(self) -> Configuration:
-        """Everything that can be known to be wrong is refused here, before anything is written.
-
-        Raises:
-            UsageError: an option cannot be right.
-            AVPError: a scene cannot be used.
-        """
+        """Everything that can be known to be wrong is refused here, before anything is written."""
         if self.preset not in PRESETS:
             raise unknown_name("preset", self.preset, PRESETS)
         methods = chosen_methods(DEFAULT if self.methods == AUTO else _split(self.methods))
         preset = PRESETS[self.preset]
-        preset = replace(preset, seeds=_number("seeds", self.seeds, preset.seeds))
-        preset = replace(preset, starts=_number("starts", self.starts, preset.starts))
+        seeds, starts = _number("seeds", self.seeds, preset.seeds), _number("starts", self.starts, preset.starts)
+        preset = replace(preset, seeds=seeds, starts=starts)
         choice = SimulatorChoice(self.simulator, up=self.up)
         metrics = _split(self.metrics)
         find_metrics(metrics)
@@ -72,8 +77,7 @@ class Compare:
     @property
     def line(self) -> str:
         """The command line as a user types it."""
-        given = {field.name: (getattr(self, field.name), field.default) for field in fields(self)}
-        chosen = {name: str(value) for name, (value, default) in given.items() if value != default}
+        chosen = {name: str(value) for name, value in vars(self).items() if value != getattr(Compare, name)}
         if os.environ.get("MLFLOW_RUN_ID"):
             options = [f"-P {name}={shlex.quote(value)}" for name, value in chosen.items()]
             return " ".join(["mlflow run . -e compare --env-manager local", *options])
@@ -101,17 +105,16 @@ def compare(configuration: Configuration, out: Path, *, jobs: int, line: str) ->
     """
     from avp_experiment.report import write_report
     from avp_experiment.results import gather
-    from avp_experiment.tracking import log_results, open_parent, tracking_uri
 
     folder = open_folder(configuration, out)
     with folder.alone():
-        folder.check_disk(plan(configuration, out, tracking="?"), configuration)
         parent, experiment = open_parent(f"compare {configuration.preset_name}")
         status = "FAILED"
         try:
             cells = plan(configuration, out, tracking=experiment)
+            print(f"{sum(not folder.is_done(cell) for cell in cells)} of {len(cells)} cells to do: {out}")
             preload = () if SimulatorChoice(configuration.simulator).one_per_process else PRELOAD
-            runner = Runner(folder, jobs, environment(tracking_uri()), preload)
+            runner = Runner(folder, jobs, environment(parent.address), preload)
             runner.run(cells)
             results = gather(configuration, folder, cells, command=line)
             write_report(out)
@@ -126,10 +129,62 @@ def compare(configuration: Configuration, out: Path, *, jobs: int, line: str) ->
     print(f"results:      {out}/results.md (tables, figures, claims; from {out}/results.json)")
     print(f"MLflow run:   {parent.run_id}")
     if runner.failed:
-        raise AVPError(
-            f"{len(runner.failed)} of {len(cells)} cells failed (reasons: {out}/results.md); "
-            f"the same command tries them again"
-        )
+        failed = f"{len(runner.failed)} of {len(cells)} cells failed (reasons: {out}/results.md)"
+        raise AVPError(f"{failed}; the same command tries them again")
+
+
+def open_parent(name: str) -> tuple[TrackedRun, str]:
+    """The run that `mlflow run` has begun, else a new one; and the MLflow experiment, also that of the trainings."""
+    address, begun = os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_ADDRESS, os.environ.get("MLFLOW_RUN_ID")
+    if begun:
+        client = connect(address)
+        identity = existing_run(client, begun).info.experiment_id
+        client.set_tag(begun, KIND_TAG, KIND)
+        return join_run(address, begun), client.get_experiment(identity).name
+    experiment = os.environ.get(NAME_VARIABLE) or EXPERIMENT
+    return start_run(address, NewRun(experiment=experiment, name=name, tags={KIND_TAG: KIND})), experiment
+
+
+def log_results(run: TrackedRun, experiment: str, results: Mapping[str, Any], folder: Path) -> None:
+    """Tables, figures and means into the parent, its trainings below it, and a run for each method, scene and seed."""
+    settings = {name: value for name, value in results["configuration"].items() if name != "scenes"}
+    scenes = {f"scene.{scene['role']}.{i}": scene["name"] for i, scene in enumerate(results["configuration"]["scenes"])}
+    run.params(flat({"experiment": settings}) | scenes)
+    for pattern in _ARTIFACTS:
+        for path in sorted(folder.glob(pattern)):
+            run.file(path)
+    by_method: dict[str, list[dict[str, float]]] = defaultdict(list)
+    for (method, role, scene, seed), figures in _by_seed(results).items():
+        by_method[f"{role}/{method}"].append(figures)
+        tags = {POLICY_TAG: method, SCENE_TAG: scene, METHOD_TAG: "experiment", "avp.role": role}
+        tags |= {KIND_TAG: "experiment-cell"}
+        name = f"{method} on {scene} (seed {seed})"
+        child = start_run(run.address, NewRun(experiment=experiment, name=name, tags=tags, parent=run.run_id))
+        child.params({"method": method, "scene": scene, "role": role, "seed": seed})
+        child.metrics({f"eval/{name}": value for name, value in figures.items()}, 0)
+        child.close("FINISHED")
+    for prefix, seeds in by_method.items():
+        common = set.intersection(*map(set, seeds))
+        run.metrics({f"{prefix}/{name}": sum(one[name] for one in seeds) / len(seeds) for name in sorted(common)}, 0)
+    run.metrics({"failed_cells": float(len(results["failed"]))}, 0)
+    run.flush()
+    client = connect(run.address)
+    for training in results["training"]:
+        # Also those that an earlier start of the experiment made.
+        if find_run(client, training["run_id"]) is not None:
+            client.set_tag(training["run_id"], PARENT_TAG, run.run_id)
+
+
+def _by_seed(results: Mapping[str, Any]) -> dict[tuple[str, str, str, int], dict[str, float]]:
+    """Means over starts, by method, role, scene and seed."""
+    found: dict[tuple[str, str, str, int], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    shown = (*_SHOWN, *results["figures"])
+    for part in (*results["rollouts"], *(one for one in results["reconstructions"] if one["whole"])):
+        figures = part["scores"] if "scores" in part else part["metrics"]
+        for name, value in figures.items():
+            if value is not None and (name in shown or "scores" in part):
+                found[part["method"], part["role"], part["scene"], part["seed"]][name].append(value)
+    return {key: {name: sum(values) / len(values) for name, values in one.items()} for key, one in found.items()}
 
 
 def main(options: Compare) -> None:

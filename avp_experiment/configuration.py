@@ -1,5 +1,6 @@
 """What an experiment consists of: methods, scenes, and a preset for each kind of machine and purpose."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,9 +25,9 @@ class Method:
     spec: str
     """The policy or reward: its name or `module:object`."""
     learned: bool = False
-    """Whether it is a reward."""
+    """It is a reward."""
     in_rooms: bool = False
-    """Whether it is trained in generated rooms, never in the scenes of the experiment."""
+    """Trained in generated rooms, never in the scenes of the experiment."""
 
     @property
     def name(self) -> str:
@@ -50,8 +51,7 @@ def known_methods() -> dict[str, Method]:
 
 
 BASELINES = ("heuristic", "random", "frontier", "greedy", "oracle", "survey")
-"""What learned policies are compared with by default; the last two plan with full knowledge, for floor and for all
-surfaces."""
+"""What learned policies are compared with by default; the last two plan with full knowledge."""
 DEFAULT = (*BASELINES, *REWARDS, f"proposed{ROOMS}", f"surface{ROOMS}")
 """The baselines, every reward, and the rewards with a learned stop trained over many rooms."""
 
@@ -59,12 +59,7 @@ DEFAULT = (*BASELINES, *REWARDS, f"proposed{ROOMS}", f"surface{ROOMS}")
 def chosen_methods(names: Sequence[str]) -> tuple[Method, ...]:
     """The methods of these names, each once: known ones in their order, then those of the form `module:object`.
 
-    Args:
-        names: known ones, or `module:object` of a class or object with `predict`, or else of a reward; a reward's may
-            end in `_rooms`.
-
-    Raises:
-        UsageError: no such method, with the nearest name, or none at all.
+    That is a class or object with `predict`, or else a reward, whose name may end in `_rooms`.
     """
     if not names:
         raise UsageError("methods: expected at least one, got none")
@@ -72,14 +67,12 @@ def chosen_methods(names: Sequence[str]) -> tuple[Method, ...]:
     for name in names:
         if ":" not in name and name not in known:
             raise unknown_name("method", name, known)
-    placed = [_placed(name) for name in dict.fromkeys(names) if ":" in name]
-    return (*(method for name, method in known.items() if name in names), *placed)
-
-
-def _placed(name: str) -> Method:
-    spec = name.removesuffix(ROOMS)
-    learned = not hasattr(plugins.find("avp.policies", spec, {}), "predict")
-    return Method(spec, learned, in_rooms=learned and name != spec)
+    chosen = [method for name, method in known.items() if name in names]
+    for name in dict.fromkeys(name for name in names if ":" in name):
+        spec = name.removesuffix(ROOMS)
+        learned = not hasattr(plugins.find("avp.policies", spec, {}), "predict")
+        chosen.append(Method(spec, learned, in_rooms=learned and name != spec))
+    return tuple(chosen)
 
 
 @dataclass(frozen=True)
@@ -97,13 +90,11 @@ class ExperimentPreset:
     observation: str = "map"
     """What the policies observe; `map` becomes what the reward `surface` needs for that reward."""
     rooms: int = 16
-    """How many generated rooms."""
     size: tuple[int, int] = (640, 480)
     """Width and height of the pictures in pixels."""
     reconstruction: str = "avp-nerfacto"
     """nerfstudio's method."""
     iterations: int = 30_000
-    """Of each reconstruction."""
     prefixes: tuple[int, ...] = (20, 40, 60)
     """Each episode is also reconstructed from its first so many frames."""
     budget: int = 80
@@ -125,19 +116,17 @@ hours on two cores. gpu: the same questions at full size. paper: the paper's obs
 
 @dataclass(frozen=True)
 class ExperimentScene:
-    """A scene of the experiment."""
+    """A scene: as the user named it, and its name without folders."""
 
     spec: str
-    """As the user named it."""
     name: str
-    """Without folders."""
     sha256: str
     role: str
     """`TRAIN` or `UNSEEN`."""
 
 
 def scene_slug(name: str) -> str:
-    """A scene's name for files: `white_room.glb` becomes `white_room`, `builtin:0` becomes `builtin_0`."""
+    """A scene's name for files: `white_room` of `white_room.glb`, `builtin_0` of `builtin:0`."""
     return Path(name).stem.replace(":", "_")
 
 
@@ -152,7 +141,7 @@ class Configuration:
     """Of training first, then unseen ones."""
     methods: tuple[Method, ...]
     metrics: tuple[str, ...] = ()
-    """Further ones, of episodes and rollouts: `module:function` or what another distribution registers."""
+    """Of the user, by name or `module:function`."""
     simulator: str = "raycast"
     up: str | None = None
     """Axis of mesh files that points up; the scenes' digests cover it."""
@@ -161,12 +150,12 @@ class Configuration:
     def rooms(self) -> tuple[str, ...]:
         """The generated rooms of the methods that train in such, none of them a scene of the experiment."""
         taken = {scene.name for scene in self.scenes}
-        seeds = range(_FIRST_ROOM, _FIRST_ROOM + self.preset.rooms + len(taken))
-        return tuple([room for seed in seeds if (room := f"builtin:{seed}") not in taken][: self.preset.rooms])
+        rooms = (f"builtin:{seed}" for seed in itertools.count(_FIRST_ROOM))
+        return tuple(itertools.islice((room for room in rooms if room not in taken), self.preset.rooms))
 
     @property
     def simulator_options(self) -> tuple[str, ...]:
-        """The options of commands that open a scene."""
+        """Of commands that open a scene."""
         return ("--simulator", self.simulator, *(("--up", self.up) if self.up else ()))
 
     def as_json(self) -> dict[str, Any]:
@@ -181,12 +170,7 @@ class Configuration:
 
 
 def read_scenes(train: Sequence[str], unseen: Sequence[str], choice: SimulatorChoice) -> tuple[ExperimentScene, ...]:
-    """Open every scene once, so that one that cannot be used is named before anything long begins.
-
-    Raises:
-        UsageError: no scene of training, one given twice, or a name that cannot be right.
-        AVPError: a scene cannot be read, or nobody can stand in it.
-    """
+    """Open every scene once, so that one that cannot be used is named before anything long begins."""
     if not train:
         raise UsageError("scene: expected at least one scene of training, got none")
     found: list[ExperimentScene] = []
@@ -197,10 +181,8 @@ def read_scenes(train: Sequence[str], unseen: Sequence[str], choice: SimulatorCh
             scene = ExperimentScene(spec, opened.scene, opened.scene_digest, role)
             opened.close()
             for other in found:
-                if scene.sha256 == other.sha256:
-                    same = f"the same scene as {other.spec}, given as {other.role}; expected each scene once"
-                    raise UsageError(f"{spec}: {same}")
-                if scene_slug(scene.name) == scene_slug(other.name):
-                    raise UsageError(f"{spec}: has the same name as {other.spec}; expected scenes of different names")
+                if scene.sha256 == other.sha256 or scene_slug(scene.name) == scene_slug(other.name):
+                    same = "the same scene as" if scene.sha256 == other.sha256 else "named as"
+                    raise UsageError(f"{spec}: {same} {other.spec}, given as {other.role}; expected each name once")
             found.append(scene)
     return tuple(found)

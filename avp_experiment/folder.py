@@ -3,13 +3,13 @@
 import fcntl
 import json
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from avp_experiment.cells import COLLECT, RECONSTRUCT, TRAIN, Cell
+from avp_experiment.cells import TRAIN, Cell
 from avp_experiment.configuration import Configuration
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.files import atomic_file
@@ -17,7 +17,6 @@ from avp_habitat.files import atomic_file
 FORMAT = 1
 CONFIGURATION = "experiment.json"
 DONE, FAILED, LOG = "cell.json", "failed.json", "log.txt"
-_MB = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -27,7 +26,7 @@ class Folder:
     root: Path
 
     def record(self, cell: Cell) -> dict[str, Any] | None:
-        """What is known of a finished cell: `seconds`, `commit`, `finished`, `facts`; None when it is not done."""
+        """`seconds`, `commit`, `finished` and `facts` of a finished cell; None when it is not done."""
         return _read(cell.folder(self.root) / DONE)
 
     def failure(self, cell: Cell) -> str | None:
@@ -45,7 +44,7 @@ class Folder:
 
     def is_empty(self, cell: Cell) -> bool:
         """Whether a rollout is so short that its first frames are all of it, which another cell reconstructs."""
-        if cell.kind != RECONSTRUCT or cell.frames is None or cell.needs is None:
+        if cell.frames is None or cell.needs is None:
             return False
         about = self.record(cell.needs)
         return about is not None and about["facts"]["metrics"]["views"] <= cell.frames
@@ -84,23 +83,6 @@ class Folder:
                 raise UsageError(f"out: another program is working on {self.root}; wait for it, or stop it") from None
             yield
 
-    def check_disk(self, cells: Sequence[Cell], configuration: Configuration) -> None:
-        """Say how much is to do, and refuse to begin what the disk cannot hold.
-
-        Raises:
-            AVPError: there is too little room.
-        """
-        left = [cell for cell in cells if not self.is_done(cell)]
-        needed, free = _bytes_needed(left, configuration), shutil.disk_usage(self.root).free
-        if needed > free:
-            raise AVPError(
-                f"out: {self.root}: the {len(left)} cells to do need about {_size(needed)}, and {_size(free)} are "
-                "free there; name a folder on another disk, or a smaller preset, fewer seeds, starts or methods"
-            )
-        print(
-            f"{len(left)} of {len(cells)} cells to do, about {_size(needed)} of disk ({_size(free)} free): {self.root}"
-        )
-
 
 def open_folder(configuration: Configuration, root: Path) -> Folder:
     """Write the configuration into the experiment's folder, or hold it against the one that is there.
@@ -111,24 +93,18 @@ def open_folder(configuration: Configuration, root: Path) -> Folder:
     """
     path, wanted = root / CONFIGURATION, configuration.as_json()
     if path.exists():
-        known = _known(path)
+        known = _read(path) or {}
+        if (version := known.pop("format", None)) != FORMAT:
+            raise AVPError(f"{path}: expected an experiment's configuration of format {FORMAT}, found {version!r}")
         # Methods and starts may be added.
         names = sorted({*wanted, *known} - {"starts"})
         if different := [name for name in names if wanted.get(name) != known.get(name)]:
-            told = "; ".join(
-                f"{name} {str(known.get(name))[:60]} there, {str(wanted.get(name))[:60]} asked for"
-                for name in different
-            )
-            raise UsageError(
-                f"out: {root} holds an experiment of another configuration: {told}; name another folder, or remove it"
-            )
+            told = [f"{name} {known.get(name)} there, {wanted.get(name)} asked for" for name in different]
+            raise UsageError(f"out: {root} holds an experiment of another configuration: {'; '.join(told)}")
         return Folder(root)
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
-        raise UsageError(
-            f"out: {root} is no experiment's folder (it has no {CONFIGURATION}); expected a new or empty folder"
-        )
+        raise UsageError(f"out: {root} is no experiment's folder: expected {CONFIGURATION}, or a new or empty folder")
     try:
-        root.mkdir(parents=True, exist_ok=True)
         fixed = {name: value for name, value in wanted.items() if name != "starts"}
         write_json(path, {"format": FORMAT, **fixed}, indent=1)
     except OSError as error:
@@ -148,27 +124,3 @@ def _read(path: Path) -> dict[str, Any] | None:
     except (OSError, ValueError):
         return None
     return found if isinstance(found, dict) else None
-
-
-def _known(path: Path) -> dict[str, Any]:
-    known = _read(path)
-    if known is None or "format" not in known:
-        raise AVPError(f"{path}: expected an experiment's configuration, could not read it")
-    if (version := known.pop("format")) != FORMAT:
-        raise AVPError(f"{path}: expected format {FORMAT}, found {version!r}")
-    return known
-
-
-def _bytes_needed(cells: Sequence[Cell], configuration: Configuration) -> int:
-    """About how much disk cells take; measured: a picture with its depth takes up to 3.5 bytes per pixel."""
-    from avp_habitat.rollout.capture import VIEWS
-
-    width, height = configuration.preset.size
-    rollout = 7 * width * height * (configuration.preset.budget + VIEWS) // 2
-    size = {TRAIN: 8 * _MB, COLLECT: rollout, RECONSTRUCT: _MB}
-    # A reconstruction's checkpoint and logs lie there while it runs.
-    return sum(size[cell.kind] for cell in cells) + (200 * _MB if cells else 0)
-
-
-def _size(count: int) -> str:
-    return f"{count / 1e6:,.0f} MB"

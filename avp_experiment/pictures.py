@@ -8,7 +8,7 @@ import numpy as np
 
 from avp_experiment.configuration import TRAIN, UNSEEN, scene_slug
 from avp_experiment.plots import WIDTH_IN, Drawn, Missing, new_figure
-from avp_experiment.results import PICTURES, EpisodeResult, Results, floor_of
+from avp_experiment.results import PICTURES, EpisodeResult, Results
 from avp_habitat.metrics import FIGURES
 from avp_habitat.poses import heading
 from avp_habitat.rollout.images import read_rgb
@@ -22,10 +22,9 @@ DEFAULT_MAPS = ("heuristic", "coverage", "proposed")
 """Methods of figure 5."""
 DEFAULT_RENDERS = ("heuristic", "survey", "coverage", "proposed", "surface")
 """Methods of figure 6, as far as they are there; else the first ones."""
-_ARROW_M = 0.22
-_UNSEEN_COLOUR = "#C9CCD2"
-_PATH_COLOUR = "#B22234"
 _COLUMNS = 5
+_ARROW_M = 0.22
+_UNSEEN_COLOUR, _PATH_COLOUR = "#C9CCD2", "#B22234"
 
 
 def maps(results: Results, methods: Sequence[str] = DEFAULT_MAPS) -> Drawn:
@@ -36,44 +35,38 @@ def maps(results: Results, methods: Sequence[str] = DEFAULT_MAPS) -> Drawn:
     shown = [method for method in methods if any((method, scene) in drawn for scene in scenes)]
     if not shown:
         raise Missing(f"no episode of {', '.join(methods)} has a map")
-    numbers = {which: floor_of(dict(one.floor or {})) for which, one in drawn.items() if which[0] in shown}
+    numbers = {which: one.floor["numbers"] for which, one in drawn.items() if one.floor and which[0] in shown}
     last = max(int(floor.max()) - 1 for floor in numbers.values())
-    tallest = []
-    for scene in scenes:
-        shapes = [numbers[method, scene].shape for method in shown if (method, scene) in numbers]
-        tallest.append(max(rows / columns for rows, columns in shapes))
+    tallest = [max(np.divide(*floor.shape) for (_, of), floor in numbers.items() if of == scene) for scene in scenes]
     width_in = (WIDTH_IN - 1.2) / len(shown)
     picture = new_figure(min(11.0, sum(share * width_in + 0.55 for share in tallest)))
     panels = picture.subplots(len(scenes), len(shown), squeeze=False, gridspec_kw={"height_ratios": tallest})
     image: Any = None
     for row, scene in zip(panels, scenes, strict=True):
         for axes, method in zip(row, shown, strict=True):
-            rollout = drawn.get((method, scene))
-            if rollout is None:
+            if (method, scene) in drawn:
+                image = _draw_map(axes, drawn[method, scene], last)
+            else:
                 axes.set_axis_off()
                 axes.set_title(f"{method}: no episode", fontsize=9)
-                continue
-            image = _draw_map(axes, rollout, numbers[method, scene], last)
         row[0].set_ylabel(f"{scene}\nz [m]", fontsize=9)
     for axes in panels[-1]:
         axes.set_xlabel("x [m]", fontsize=9)
     picture.colorbar(image, ax=panels.ravel().tolist(), label="cell first observed by view", shrink=0.8, pad=0.01)
-    left_out = [method for method in methods if method not in shown]
-    note = f" No map of {', '.join(left_out)}." if left_out else ""
+    left_out = ", ".join(method for method in methods if method not in shown)
     caption = (
         "One episode of each method from above (seed 0, first start, the same place for all). Cells are shaded by the "
         "view that first observed them, grey: never observed. Red: the path; white dot: first view, red dot: last; "
         "arrows: where the camera faced."
     )
-    return Drawn(picture, caption + note)
+    return Drawn(picture, caption + (f" No map of {left_out}." if left_out else ""))
 
 
 def same_views(results: Results, role: str) -> Drawn:
     """Figure 6: held-out views and what the reconstructions of some methods make of them, each with its PSNR."""
-    scenes = results.scenes(role)
-    if not scenes:
+    if not results.scenes(role):
         raise Missing(f"no scene of role {role}")
-    scene = scenes[0]
+    scene = results.scenes(role)[0]
     found = _pictures_by_view(results, scene)
     there = [method for method in results.methods if any(method in named for named in found.values())]
     columns = ["truth", *([method for method in DEFAULT_RENDERS if method in there] or there)[:_COLUMNS]]
@@ -90,22 +83,23 @@ def same_views(results: Results, role: str) -> Drawn:
             axes.set_title(head + psnr, fontsize=9)
             if name in named:
                 axes.imshow(read_rgb(named[name]), interpolation="nearest")
-    left_out = [method for method in there if method not in columns]
+    left_out = ", ".join(method for method in there if method not in columns)
     caption = (
         f"Held-out views {', '.join(map(str, found))} of {scene}: truth, and renders from the reconstructions of whole "
         "episodes (seed 0, first start), each with this view's PSNR."
     )
-    return Drawn(picture, caption + (f" Not shown: {', '.join(left_out)}." if left_out else ""))
+    return Drawn(picture, caption + (f" Not shown: {left_out}." if left_out else ""))
 
 
-def _draw_map(axes: "Axes", rollout: EpisodeResult, numbers: np.ndarray, last: int) -> Any:
+def _draw_map(axes: "Axes", rollout: EpisodeResult, last: int) -> Any:
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
 
     # Without its lightest part, which on white cannot be told from what is no floor.
     shades = ListedColormap(colormaps["YlGnBu"](np.linspace(0.2, 1, 256)))
     assert rollout.floor is not None
-    cell, (x, z), (rows, columns) = (rollout.floor[name] for name in ("cell_m", "origin_m", "shape"))
+    numbers, cell, (x, z) = (rollout.floor[name] for name in ("numbers", "cell_m", "origin_m"))
+    rows, columns = numbers.shape
     extent = (x, x + columns * cell, z + rows * cell, z)
     base = np.ma.masked_where(numbers == NOT_NAVIGABLE, np.zeros(numbers.shape))
     axes.imshow(base, extent=extent, cmap=ListedColormap([_UNSEEN_COLOUR]), interpolation="nearest")

@@ -19,10 +19,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CPV, REWARD = "avp/cpv", "rollout/ep_rew_mean"
-_MILLION = 1e6
-_ROLES = {TRAIN: "scene of training", UNSEEN: "unseen scene"}
 WIDTH_IN = 9.6
-_DPI = 100
+_MILLION, _DPI = 1e6, 100
+_ROLES = {TRAIN: "scene of training", UNSEEN: "unseen scene"}
 
 
 class Missing(Exception):
@@ -31,12 +30,10 @@ class Missing(Exception):
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure with what is to be said below it."""
+    """A figure, not written yet, with what is to be said below it."""
 
     picture: "Figure"
-    """Not written yet."""
     caption: str
-    """What is plotted, of how many seeds and starts."""
 
     def save(self, path: Path) -> None:
         """Write a PNG of 256 colours, which keeps photographs small."""
@@ -75,6 +72,11 @@ def new_figure(height_in: float) -> "Figure":
     return Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
 
 
+def span(counts: Sequence[int]) -> str:
+    """As 3, or as 2 to 3."""
+    return " to ".join(map(str, sorted({min(counts), max(counts)})))
+
+
 def cpv_while_training(results: Results) -> Drawn:
     """Figure 3: coverage per view while training."""
     trained = _trained(results, CPV)
@@ -94,13 +96,11 @@ def reward_while_training(results: Results) -> Drawn:
     columns = min(3, len(trained))
     rows = -(-len(trained) // columns)
     picture = new_figure(0.4 + 2.4 * rows)
-    panels = list(np.ravel(picture.subplots(rows, columns, squeeze=False)))
-    for axes, (method, trainings) in zip(panels, trained.items(), strict=False):
+    for place, (method, trainings) in enumerate(trained.items()):
+        axes = picture.add_subplot(rows, columns, place + 1)
         _training_curve(axes, method, trainings, REWARD)
         axes.set_title(method, fontsize=10)
         axes.grid(alpha=0.3)
-    for axes in panels[len(trained) :]:
-        axes.set_axis_off()
     picture.supxlabel("environment steps while training [millions]", fontsize=10)
     picture.supylabel("mean reward of an episode", fontsize=10)
     return Drawn(
@@ -146,7 +146,9 @@ def visibility_and_psnr(results: Results) -> Drawn:
             _scatter(axes, [point for point in points if point.method == method], name)
         axes.set_xlabel(FIGURES[name].heading)
         axes.grid(alpha=0.3)
-        axes.set_title(_correlation_title(points, name), fontsize=10)
+        found = correlations(points, name)
+        lines = [f"{where}: {found[where] or 'too few points'}" for where in ("all", "whole episodes")]
+        axes.set_title("\n".join([f"{name} and PSNR", *lines]), fontsize=10)
     panels[0].set_ylabel("PSNR on held-out views [dB]")
     _legend(picture, panels[:1])
     whole = sum(point.whole for point in points)
@@ -169,8 +171,7 @@ def _trained(results: Results, metric: str) -> dict[str, list[Training]]:
 
 
 def _bands(trained: dict[str, list[Training]]) -> str:
-    counts = sorted({len(trainings) for trainings in trained.values()})
-    seeds = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
+    seeds = span([len(trainings) for trainings in trained.values()])
     return f"Lines: mean over {seeds} seeds; bands: from the lowest seed to the highest."
 
 
@@ -190,15 +191,14 @@ def _psnr_points(results: Results, method: str, role: str) -> list[tuple[float, 
     """Number of views, and PSNR by episode: of the first frames where all episodes have so many, and of all frames."""
     episodes = results.reconstruction_curves(method, role)
     scored = [(key, one) for key, curve in episodes.items() for one in curve.values() if "psnr" in one.scores]
-    first: dict[int, dict[Key, float]] = {}
-    for key, one in scored:
-        if not one.whole:
-            first.setdefault(one.frames, {})[key] = one.scores["psnr"]
-    points = [(float(views), first[views]) for views in sorted(first) if len(first[views]) == len(episodes)]
-    whole = [(key, one) for key, one in scored if one.whole]
-    if whole:
-        views = float(np.mean([one.frames for _, one in whole]))
-        points.append((views, {key: one.scores["psnr"] for key, one in whole}))
+    points = []
+    for views in sorted({one.frames for _, one in scored if not one.whole}):
+        first = {key: one.scores["psnr"] for key, one in scored if not one.whole and one.frames == views}
+        if len(first) == len(episodes):
+            points.append((float(views), first))
+    if whole := {key: one for key, one in scored if one.whole}:
+        views = float(np.mean([one.frames for one in whole.values()]))
+        points.append((views, {key: one.scores["psnr"] for key, one in whole.items()}))
     return points
 
 
@@ -227,12 +227,6 @@ def _scatter(axes: "Axes", points: Sequence[Point], name: str) -> None:
         shares = [FIGURES[name].scale * point.shares[name] for point in chosen]
         label = chosen[0].method if whole or len(chosen) == len(points) else None
         axes.scatter(shares, [point.psnr for point in chosen], label=label, linewidths=1.1, **look)
-
-
-def _correlation_title(points: Sequence[Point], name: str) -> str:
-    found = correlations(points, name)
-    lines = [f"{where}: {found[where] or 'too few points'}" for where in ("all", "whole episodes")]
-    return "\n".join([f"{name} and PSNR", *lines])
 
 
 def _legend(picture: "Figure", panels: Any) -> None:

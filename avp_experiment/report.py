@@ -1,58 +1,50 @@
 """`python -m avp_experiment.report`: every table and figure of an experiment, and the page that holds them."""
 
+import csv
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from tyro.conf import Positional
 
+from avp_experiment import plots
 from avp_experiment.claims import claims
-from avp_experiment.configuration import TRAIN, UNSEEN
+from avp_experiment.configuration import ROOMS, TRAIN, UNSEEN
 from avp_experiment.pictures import DEFAULT_MAPS, maps, same_views
-from avp_experiment.plots import (
-    Drawn,
-    Missing,
-    cpv_while_training,
-    psnr_by_views,
-    reward_while_training,
-    visibility_and_psnr,
-)
-from avp_experiment.results import FILE, Results, read_results
-from avp_experiment.tables import make_table
+from avp_experiment.results import FILE, Key, Results, read_results
+from avp_experiment.statistics import NOTHING, Summary, summary
 from avp_habitat import command
 from avp_habitat.errors import AVPError, unknown_name
+from avp_habitat.metrics import FIGURES, Figure
+from avp_habitat.tables import table
 
 PAGE, CLAIMS, READING = "results.md", "claims.md", "reading.md"
 _TABLES = {
     "table2": (TRAIN, "Table 2: scenes of training"),
     "table3": (UNSEEN, "Table 3: unseen scenes, no retraining"),
 }
+SCORES = ("psnr", "ssim", "lpips")
+COLUMNS = ("views", "coverage", "annd_m", "ei", "path_length_m", "visibility", *SCORES)
+"""The suite's figures that the tables show; those that users added follow."""
+Rows = Mapping[str, Mapping[str, Summary | None]]
 _SETTINGS = ("seeds", "starts", "budget", "observation", "steps", "steps_rooms", "width", "height", "reconstruction",
              "iterations")  # fmt: skip
 
 
 def write_report(folder: Path, *, shown_maps: Sequence[str] = DEFAULT_MAPS) -> Path:
-    """Write tables, figures (5 of some methods), claims and the page that holds them; gives the page.
-
-    Raises:
-        UsageError: no such folder.
-        AVPError: the results are damaged, or the folder cannot be written.
-    """
+    """Write tables, figures (5 of some methods), claims and the page that holds them; gives the page."""
     results = read_results(folder)
-    parts: dict[str, Callable[[], str]] = {
-        title: partial(_table, results, name, role, title) for name, (role, title) in _TABLES.items()
-    }
-    parts |= {
-        title: partial(_figure, results, name, title, draw) for name, (title, draw) in _figures(shown_maps).items()
-    }
+    parts = [(title, partial(_table, role=role), name) for name, (role, title) in _TABLES.items()]
+    parts += [(title, partial(_figure, draw=draw), name) for name, (title, draw) in _figures(shown_maps).items()]
     sections, left_out = [], []
     try:
-        for title, make in parts.items():
+        for title, make, name in parts:
             try:
-                sections.append(f"## {title}\n\n{make()}")
-            except Missing as reason:
+                sections.append(f"## {title}\n\n{make(results, name, title)}")
+            except plots.Missing as reason:
                 left_out.append(f"- {title}: {reason}.")
         said = claims(results)
         (folder / CLAIMS).write_text(said, encoding="utf-8")
@@ -66,36 +58,88 @@ def write_report(folder: Path, *, shown_maps: Sequence[str] = DEFAULT_MAPS) -> P
     return folder / PAGE
 
 
-def _figures(shown_maps: Sequence[str]) -> dict[str, tuple[str, Callable[[Results], Drawn]]]:
+def _figures(shown_maps: Sequence[str]) -> dict[str, tuple[str, Callable[[Results], plots.Drawn]]]:
     return {
-        "figure3": ("Figure 3: coverage per view while training", cpv_while_training),
-        "figure4": ("Figure 4: mean reward while training", reward_while_training),
+        "figure3": ("Figure 3: coverage per view while training", plots.cpv_while_training),
+        "figure4": ("Figure 4: mean reward while training", plots.reward_while_training),
         "figure5": ("Figure 5: episodes from above", partial(maps, methods=shown_maps)),
         "figure6": ("Figure 6: the same held-out views", partial(same_views, role=TRAIN)),
         "figure6_unseen": ("Figure 6, unseen scene", partial(same_views, role=UNSEEN)),
-        "psnr_by_views": ("PSNR by views", psnr_by_views),
-        "visibility": ("Visibility and PSNR", visibility_and_psnr),
+        "psnr_by_views": ("PSNR by views", plots.psnr_by_views),
+        "visibility": ("Visibility and PSNR", plots.visibility_and_psnr),
     }
 
 
-def _table(results: Results, name: str, role: str, title: str) -> str:
-    table = make_table(results, role)
+def _table(results: Results, name: str, title: str, role: str) -> str:
+    """Write the table of the scenes of a role, as Markdown and as CSV; what the page holds of it."""
     paths = [results.folder / f"{name}.{suffix}" for suffix in ("md", "csv")]
-    if table is None:
+    figures = {name: FIGURES[name] for name in COLUMNS} | dict(results.figures)
+    found = {method: {name: results.values(method, role, name) for name in figures} for method in results.methods}
+    found = {method: values for method, values in found.items() if values["coverage"]}
+    if not found:
         for path in paths:
             path.unlink(missing_ok=True)
-        raise Missing("no episode there is done" if results.scenes(role) else "no such scene in this experiment")
-    markdown, numbers, counts = table
-    for path, text in zip(paths, (f"# {title}\n\n{markdown}", numbers), strict=True):
-        path.write_text(text, encoding="utf-8")
-    episodes = " to ".join(str(count) for count in dict.fromkeys((min(counts), max(counts))))
+        raise plots.Missing("no episode there is done" if results.scenes(role) else "no such scene in this experiment")
+    shown = [figure for name, figure in figures.items() if any(values[name] for values in found.values())]
+    rows = {method: {one.name: summary(values[one.name]) for one in shown} for method, values in found.items()}
+    missing = [figure for figure in figures.values() if figure not in shown]
+    notes = [f"No {figure.heading}: {_why_missing(results, figure.name)}." for figure in missing]
+    cells = [
+        [method, *(mean.text(one) if (mean := row[one.name]) else NOTHING for one in shown)]
+        for method, row in rows.items()
+    ]
+    lines = table(["method", *(figure.heading for figure in shown)], cells, words=1)
+    markdown = "\n".join([lines, *(f"\n{note}" for note in (*notes, *_notes(results, role, found)))])
+    episodes = {method: len(values["coverage"]) for method, values in found.items()}
+    paths[0].write_text(f"# {title}\n\n{markdown}\n", encoding="utf-8")
+    _write_csv(paths[1], rows, shown, episodes)
     return (
         f"{', '.join(results.scenes(role))}: mean ± 95 % confidence interval over {results.seeds} (Student's t), "
-        f"{episodes} episodes of each method. [CSV]({name}.csv)\n\n{markdown.rstrip()}"
+        f"{plots.span(list(episodes.values()))} episodes of each method. [CSV]({name}.csv)\n\n{markdown}"
     )
 
 
-def _figure(results: Results, name: str, title: str, draw: Callable[[Results], Drawn]) -> str:
+def _write_csv(path: Path, rows: Rows, shown: Sequence[Figure], episodes: Mapping[str, int]) -> None:
+    """The same in the same units, mean and half width in columns of their own, with more digits."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        titles = [title for figure in shown for title in (figure.heading, f"± {figure.heading}")]
+        writer.writerow(["method", "seeds", "episodes", *titles])
+        for method, row in rows.items():
+            line = [method, max((mean.seeds for mean in row.values() if mean), default=0), episodes[method]]
+            for figure in shown:
+                mean = row[figure.name]
+                both = (mean.mean, mean.half_width) if mean else (np.nan, np.nan)
+                line += ["" if np.isnan(number) else f"{figure.scale * number:.6g}" for number in both]
+            writer.writerow(line)
+
+
+def _notes(results: Results, role: str, found: Mapping[str, Mapping[str, Mapping[Key, float]]]) -> list[str]:
+    missing = [method for method in results.methods if method not in found]
+    notes = [f"No episode of {', '.join(missing)}."] if missing else []
+    most = max(len(values["coverage"]) for values in found.values())
+    fewer = [
+        f"{method} {len(values['coverage'])} episodes, {len(values['psnr'])} reconstructions"
+        for method, values in found.items()
+        if min(len(values["coverage"]), len(values["psnr"])) < most and values["psnr"]
+    ]
+    if fewer:
+        notes.append(f"Of fewer than {most} episodes or reconstructions: {'; '.join(fewer)}.")
+    if role == TRAIN and any(method.endswith(ROOMS) for method in found):
+        notes.append(f"Methods whose name ends in `{ROOMS}` were trained in generated rooms, never in these scenes.")
+    return notes
+
+
+def _why_missing(results: Results, name: str) -> str:
+    if name not in SCORES:
+        return "no episode has it"
+    reasons = {one.lpips_reason for one in results.reconstructions if name == "lpips" and one.lpips_reason}
+    whole = any(one.whole for one in results.reconstructions)
+    nothing = "no reconstruction has it" if whole or name == "lpips" else "no whole episode was reconstructed"
+    return "; ".join(sorted(reasons)) or nothing
+
+
+def _figure(results: Results, name: str, title: str, draw: Callable[[Results], plots.Drawn]) -> str:
     path = results.folder / f"{name}.png"
     # One of an earlier state of the results would stand beside figures of this one.
     path.unlink(missing_ok=True)
@@ -118,9 +162,7 @@ def _origin(results: Results) -> str:
         "preset": f"{configuration.get('preset', 'not known')}: {settings}",
         "scenes": ", ".join(f"{scene['name']} ({scene['role']})" for scene in configuration["scenes"]),
         "commits": ", ".join(f"`{commit[:12]}`" for commit in origin["commits"]) or "not known",
-        "machine": "{platform}, {processor}, {cores} cores, {gpu}".format(
-            **machine | {"gpu": machine["gpu"] or "no GPU"}
-        ),
+        "machine": "{platform}, {processor}, {cores} cores, {gpu}".format(**machine),
         "versions": ", ".join(f"{name} {version}" for name, version in origin["versions"].items()),
         "finished": f"{origin['finished']}, {origin['hours']} hours of work in all cells",
         "failed cells": str(len(results.failed)) + (" (see below)" if results.failed else ""),
@@ -145,11 +187,10 @@ class ReportOptions:
 
 def main(options: ReportOptions) -> None:
     """Make the tables and figures again."""
-    if options.maps != DEFAULT_MAPS:
-        known = read_results(options.folder).methods
-        for name in options.maps:
-            if name not in known:
-                raise unknown_name("method of --maps", name, known)
+    known = (*read_results(options.folder).methods, *DEFAULT_MAPS)
+    for name in options.maps:
+        if name not in known:
+            raise unknown_name("method of --maps", name, known)
     print(f"report: {write_report(options.folder, shown_maps=options.maps)}")
 
 

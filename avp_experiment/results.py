@@ -4,9 +4,10 @@ import base64
 import json
 import os
 import platform
+import re
 import shutil
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,9 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_experiment.cells import COLLECT, RECONSTRUCT, Cell, floor_map
-from avp_experiment.cells import TRAIN as TRAINING
-from avp_experiment.configuration import TRAIN, UNSEEN, Configuration, scene_slug
+from avp_experiment.cells import COLLECT, RECONSTRUCT, TRAIN, Cell, floor_map
+from avp_experiment.configuration import Configuration, scene_slug
 from avp_experiment.folder import Folder, write_json
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.metrics import FIGURES, Figure, figures
@@ -25,8 +25,7 @@ from avp_habitat.provenance import PACKAGES, installed_versions
 
 FORMAT = 1
 FILE, PICTURES = "results.json", "pictures"
-CELLS = {"training": TRAINING, "rollouts": COLLECT, "reconstructions": RECONSTRUCT}
-"""Kinds of cells by their keys in the file."""
+_KINDS = {"training": TRAIN, "rollouts": COLLECT, "reconstructions": RECONSTRUCT}
 Key = tuple[str, int, int]
 """Scene, seed and start: what two methods have in common."""
 
@@ -39,7 +38,6 @@ class _Measured:
     role: str
     """Of its scene: train or unseen."""
     key: Key
-    """Scene, seed and start."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +45,11 @@ class EpisodeResult(_Measured):
     """One rollout."""
 
     metrics: Mapping[str, float]
-    """Figures of the whole episode; shares within [0, 1]."""
+    """Of the whole episode."""
     coverage_curve: tuple[float, ...]
-    """Coverage after each view, within [0, 1]."""
+    """After each view, within [0, 1]."""
     floor: Mapping[str, Any] | None
-    """Its map (`floor_map`), kept of the first episode only."""
+    """Its map (`floor_map`) with its numbers, kept of the first episode only."""
 
 
 @dataclass(frozen=True)
@@ -59,13 +57,11 @@ class Reconstruction(_Measured):
     """One reconstruction of an episode's first frames, or of all of them."""
 
     frames: int
-    """How many frames it was made of."""
     whole: bool
-    """Whether those are all of the episode."""
+    """Of all frames of the episode."""
     scores: Mapping[str, float]
     """`psnr` in dB, `ssim`, `lpips`, as far as they could be computed: means over the held-out views."""
     lpips_reason: str | None
-    """Why there is no LPIPS."""
     visibility: float | None
     """Share of the held-out pixels that its frames have seen."""
     psnr_by_view: tuple[float | None, ...]
@@ -119,66 +115,47 @@ class Results:
         return {key: figures[name] for key, figures in found.items() if name in figures}
 
     def reconstruction_curves(self, method: str, role: str) -> dict[Key, dict[int, Reconstruction]]:
-        """By episode: its reconstructions by their number of frames, in ascending order, none twice.
-
-        Only episodes that have more than one are there, unless no episode has.
-        """
+        """By episode its reconstructions by number of frames, ascending; of episodes that have several, if any has."""
         found: dict[Key, dict[int, Reconstruction]] = {}
         for one in sorted(self.reconstructions, key=lambda one: (one.frames, one.whole)):
             if (one.method, one.role) == (method, role):
                 found.setdefault(one.key, {})[one.frames] = one
-        several = {key: curve for key, curve in found.items() if len(curve) > 1}
-        return several or found
+        return {key: curve for key, curve in found.items() if len(curve) > 1} or found
 
 
 def floor_of(entry: Mapping[str, Any]) -> NDArray[np.uint16]:
-    """`(rows, columns)` numbers of a map, as its rollout's `floor.png` holds them.
-
-    Raises:
-        AVPError: the entry is damaged.
-    """
-    try:
-        packed = zlib.decompress(base64.b64decode(entry["floor"], validate=True))
-        return np.frombuffer(packed, dtype="<u2").reshape(entry["shape"]).astype(np.uint16)
-    except (KeyError, TypeError, ValueError, zlib.error) as error:
-        raise AVPError(f"a map of the results cannot be read: {error}") from None
+    """`(rows, columns)` numbers of a map, as its rollout's `floor.png` holds them."""
+    packed = zlib.decompress(base64.b64decode(entry["floor"], validate=True))
+    return np.frombuffer(packed, dtype="<u2").reshape(entry["shape"]).astype(np.uint16)
 
 
 def read_results(folder: Path) -> Results:
-    """Read the results in an experiment's folder.
-
-    Raises:
-        UsageError: there is no such folder, or no `results.json` in it.
-        AVPError: that file is damaged or of another format.
-    """
+    """Read the `results.json` of an experiment's folder; an `AVPError` where that is missing or damaged."""
     path = folder / FILE
     if not path.is_file():
         raise UsageError(f"{folder}: expected the folder of an experiment (with {FILE}), found none")
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise AVPError(f"{path}: expected JSON, could not read it: {error}") from None
-    if not isinstance(value, dict) or value.get("format") != FORMAT:
-        found = value.get("format") if isinstance(value, dict) else type(value).__name__
+    found = value.get("format") if isinstance(value, dict) else type(value).__name__
+    if found != FORMAT:
         raise AVPError(f"{path}: expected results of format {FORMAT}, found {found!r}")
-    # Results of before users could add figures.
-    value.setdefault("figures", {})
-    found = {name: _part(path, value, name, made_of) for name, made_of in _PARTS.items()}
-    return Results(folder, **found)
-
-
-def _part(path: Path, value: Mapping[str, Any], name: str, made_of: Callable[[Any], Any]) -> Any:
     try:
-        return made_of(value[name])
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise AVPError(f"{path}: {name}: missing or damaged: {error!r}") from None
-
-
-def _configuration(entry: Any) -> dict[str, Any]:
-    for scene in entry["scenes"]:
-        if scene["role"] not in (TRAIN, UNSEEN) or not isinstance(scene["name"], str):
-            raise ValueError(f"a scene without a name, or neither {TRAIN} nor {UNSEEN}: {scene}")
-    return dict(entry)
+        return Results(
+            folder=folder,
+            configuration=value["configuration"],
+            methods=tuple(value["methods"]),
+            # Results of before users could add figures have none.
+            figures={name: Figure(**entry) for name, entry in value.get("figures", {}).items()},
+            origin=value["origin"],
+            training=tuple(map(_training, value["training"])),
+            rollouts=tuple(map(_episode, value["rollouts"])),
+            reconstructions=tuple(map(_reconstruction, value["reconstructions"])),
+            failed=tuple(value["failed"]),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
+        raise AVPError(f"{path}: missing or damaged: {error!r}") from None
 
 
 def _training(entry: Any) -> Training:
@@ -187,7 +164,7 @@ def _training(entry: Any) -> Training:
 
 
 def _measured(entry: Any) -> tuple[str, str, Key]:
-    return entry["method"], entry["role"], (str(entry["scene"]), int(entry["seed"]), int(entry["start"]))
+    return entry["method"], entry["role"], (entry["scene"], entry["seed"], entry["start"])
 
 
 def _numbers(entry: Any) -> dict[str, float]:
@@ -197,11 +174,11 @@ def _numbers(entry: Any) -> dict[str, float]:
 
 def _episode(entry: Any) -> EpisodeResult:
     curve = tuple(float(share) for share in entry["coverage_curve"])
-    return EpisodeResult(*_measured(entry), _numbers(entry["metrics"]), curve, entry.get("map"))
+    floor = entry.get("map") and {**entry["map"], "numbers": floor_of(entry["map"])}
+    return EpisodeResult(*_measured(entry), _numbers(entry["metrics"]), curve, floor)
 
 
 def _reconstruction(entry: Any) -> Reconstruction:
-    seen = entry.get("visibility")
     return Reconstruction(
         *_measured(entry),
         # An episode that stopped before has no more frames than it has.
@@ -209,23 +186,9 @@ def _reconstruction(entry: Any) -> Reconstruction:
         whole=bool(entry["whole"]),
         scores=_numbers(entry["scores"]),
         lpips_reason=entry.get("lpips_reason"),
-        visibility=None if seen is None else float(seen),
+        visibility=entry.get("visibility"),
         psnr_by_view=tuple(view.get("psnr") for view in entry["per_view"]),
     )
-
-
-_ORIGIN = ("command", "commits", "machine", "versions", "finished", "hours")
-_PARTS: dict[str, Callable[[Any], Any]] = {
-    "configuration": _configuration,
-    "methods": tuple,
-    "figures": lambda entries: {name: Figure(**entry) for name, entry in entries.items()},
-    "origin": lambda entry: {name: entry[name] for name in _ORIGIN},
-    "training": lambda entries: tuple(map(_training, entries)),
-    "rollouts": lambda entries: tuple(map(_episode, entries)),
-    "reconstructions": lambda entries: tuple(map(_reconstruction, entries)),
-    "failed": lambda entries: tuple({name: one[name] for name in ("cell", "reason", "log")} for one in entries),
-}
-"""What each part of the file becomes."""
 
 
 def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], *, command: str) -> dict[str, Any]:
@@ -246,7 +209,7 @@ def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], 
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
             "hours": round(sum(record["seconds"] for _, record in done) / 3600, 2),
         },
-        **{part: [_entry(cell, folder) for cell, _ in done if cell.kind == kind] for part, kind in CELLS.items()},
+        **{part: [_entry(cell, folder) for cell, _ in done if cell.kind == kind] for part, kind in _KINDS.items()},
         "failed": [
             {"cell": cell.key, "reason": reason, "log": str(folder.log(cell).relative_to(folder.root))}
             for cell in cells
@@ -262,12 +225,11 @@ def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], 
 def _machine() -> dict[str, Any]:
     import torch
 
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    # Python names no processor on most Linux systems.
+    name = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text(encoding="utf-8"))
     return {
         "platform": platform.platform(),
-        "processor": names[0] if names else platform.processor() or platform.machine(),
+        "processor": name[1] if name else platform.machine(),
         "cores": len(os.sched_getaffinity(0)),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
@@ -286,9 +248,7 @@ def _entry(cell: Cell, folder: Folder) -> dict[str, Any]:
 
 
 def _scored(cell: Cell, found: dict[str, Any], folder: Folder) -> dict[str, Any]:
-    assert cell.needs is not None
-    rollout = folder.record(cell.needs)
-    assert rollout is not None
+    rollout = (folder.record(cell.needs) if cell.needs else None) or {}
     views, seen = round(rollout["facts"]["metrics"]["views"]), found.get("visibility") or {}
     shares = seen.get("per_view") or [None] * len(found["per_view"])
     return {

@@ -11,7 +11,6 @@ import signal
 import sys
 import threading
 import time
-import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -41,14 +40,11 @@ def environment(tracking_uri: str) -> dict[str, str]:
 
 @dataclass
 class Runner:
-    """The scheduler."""
+    """The scheduler, of so many jobs at a time, with the variables of their processes."""
 
     folder: Folder
-    """Of the experiment."""
     jobs: int
-    """Cells at a time."""
     environment: dict[str, str]
-    """Of their processes."""
     preload: Sequence[str] = PRELOAD
     """Modules imported once, before any cell; with none each cell has a new process, as Habitat-Sim wants it."""
     failed: dict[str, str] = field(default_factory=dict)
@@ -125,10 +121,7 @@ def _stop(running: Sequence[Any]) -> None:
 
 def _last_lines(log: Path) -> str:
     """The error that a log ends with, else its last three lines that say something, as one."""
-    try:
-        text = log.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return "no log"
+    text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else "no log"
     said = [line.strip() for line in text.replace("\r", "\n").splitlines() if line.strip()]
     errors = [line for line in said if line.startswith("error: ")]
     return errors[-1].removeprefix("error: ") if errors else " | ".join(said[-3:])[-400:]
@@ -144,25 +137,10 @@ def execute(cell: Cell, words: Sequence[str], root: Path, variables: dict[str, s
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
             os.dup2(log.fileno(), stream.fileno())
-        started = time.monotonic()
-        print(f"$ {cell.command}", flush=True)
-        code = _run(words) or _finish(folder, cell, time.monotonic() - started)
-        sys.stdout.flush()
-        sys.stderr.flush()
-    sys.exit(code)
-
-
-def _run(words: Sequence[str]) -> int:
-    """The exit code of a command line; its program runs in this process."""
-    try:
-        return command.run(importlib.import_module(words[2]).main, words[3:])
-    except SystemExit as end:
-        if isinstance(end.code, str):
-            print(end.code, file=sys.stderr)
-        return end.code if isinstance(end.code, int) else int(end.code is not None)
-    except BaseException:
-        traceback.print_exc()
-        return 1
+    started = time.monotonic()
+    print(f"$ {cell.command}", flush=True)
+    code = command.run(importlib.import_module(words[2]).main, words[3:])
+    sys.exit(code or _finish(folder, cell, time.monotonic() - started))
 
 
 def _finish(folder: Folder, cell: Cell, seconds: float) -> int:

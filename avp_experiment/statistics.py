@@ -1,6 +1,5 @@
 """Means over seeds, differences between methods, and how well what the frames have seen predicts the reconstruction."""
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -10,6 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 from avp_experiment.results import Key, Results
 from avp_habitat.metrics import CONFIDENCE, Figure, mean_and_half_width
 
+NOTHING = "–"
+"""What tables show where there is no figure."""
+PREDICTORS = ("visibility", "coverage")
+"""What may predict PSNR."""
 RESAMPLES = 2000
 _BOOTSTRAP_SEED = 0
 
@@ -30,7 +33,7 @@ class Summary:
         return self.mean - self.half_width, self.mean + self.half_width
 
     def text(self, figure: Figure, *, sign: bool = False) -> str:
-        """Mean ± half the interval, without ± for one seed, as a figure is shown; no unit."""
+        """Mean ± half the interval as a figure is shown, without the unit."""
         shown = figure.text(self.mean, self.half_width)
         return f"+{shown}" if sign and not shown.startswith("-") else shown
 
@@ -44,9 +47,8 @@ class Correlation:
     """Lower end of the 95 % interval; nan where there is one rollout only."""
     high: float
     points: int
-    """Reconstructions."""
     rollouts: int
-    """That they were made of; what the bootstrap draws."""
+    """What the bootstrap draws."""
 
     def __str__(self) -> str:
         """As ρ = 0.91 [0.85, 0.95]."""
@@ -56,23 +58,17 @@ class Correlation:
 
 def per_seed(values: Mapping[Key, float]) -> dict[int, float]:
     """Means over scenes and starts by seed, in the seeds' order."""
-    found: dict[int, list[float]] = defaultdict(list)
-    for (_, seed, _), value in values.items():
-        found[seed].append(value)
-    return {seed: float(np.mean(found[seed])) for seed in sorted(found)}
+    seeds = sorted({seed for _, seed, _ in values})
+    return {seed: float(np.mean([value for key, value in values.items() if key[1] == seed])) for seed in seeds}
 
 
 def summary(values: Mapping[Key, float]) -> Summary | None:
     """Mean over seeds of a figure by episode; None without any."""
-    return of_seeds(list(per_seed(values).values()))
-
-
-def of_seeds(values: Sequence[float]) -> Summary | None:
-    """Mean over seeds of a figure by seed; None without any."""
-    if not values:
+    seeds = list(per_seed(values).values())
+    if not seeds:
         return None
-    mean, half = mean_and_half_width(values)
-    return Summary(float(mean), float(half), len(values))
+    mean, half = mean_and_half_width(seeds)
+    return Summary(float(mean), float(half), len(seeds))
 
 
 def paired(left: Mapping[Key, float], right: Mapping[Key, float]) -> Summary | None:
@@ -84,32 +80,31 @@ def saved_share(less: Mapping[Key, float], more: Mapping[Key, float]) -> Summary
     """By how much `less` lies below `more`, as a share of `more`: of the means of each seed over common episodes."""
     common = [key for key in less if key in more]
     first, second = per_seed({key: less[key] for key in common}), per_seed({key: more[key] for key in common})
-    return of_seeds([1 - first[seed] / second[seed] for seed in first])
+    return summary({("", seed, 0): 1 - first[seed] / second[seed] for seed in first})
 
 
 def at_views(curve: Mapping[int, float], views: float) -> float | None:
-    """A figure at a number of views, by number of views, linear between measured ones; None outside of them."""
-    measured = sorted(curve)
+    """A figure at a number of views, of those measured (ascending) or between; None outside of them."""
+    measured = list(curve)
     if not measured or not measured[0] <= views <= measured[-1]:
         return None
-    return float(np.interp(views, measured, [curve[k] for k in measured]))
+    return float(np.interp(views, measured, list(curve.values())))
 
 
 def views_to_reach(curve: Mapping[int, float], target: float) -> float | None:
     """The least number of views, of those measured or between, at which a figure reaches a target; None for never."""
     measured, values = list(curve), list(curve.values())
-    reached = next((place for place, value in enumerate(values) if value >= target), None)
-    if not reached:
-        return None if reached is None else float(measured[0])
-    both = slice(reached - 1, reached + 1)
-    return float(np.interp(target, values[both], measured[both]))
+    for place, value in enumerate(values):
+        if value >= target:
+            both = slice(max(place - 1, 0), place + 1)
+            return float(np.interp(target, values[both], measured[both]))
+    return None
 
 
 def spearman(x: ArrayLike, y: ArrayLike, rollout: Sequence[object]) -> Correlation | None:
     """Spearman's ρ of `(n,)` and `(n,)`; its interval draws whole rollouts, `(n,)`, whose points are not independent.
 
-    Returns:
-        None for fewer than three points, or where one of the two does not vary.
+    None for fewer than three points, or where one of the two does not vary.
     """
     x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
@@ -130,11 +125,9 @@ def _rho(x: NDArray, y: NDArray, times: NDArray) -> NDArray:
     ranks = [_ranks(values, times) for values in (x, y)]
     total = times.sum(axis=1, keepdims=True)
     first, second = (rank - (times * rank).sum(axis=1, keepdims=True) / total for rank in ranks)
-    products = [
-        (times * left * right).sum(axis=1) for left, right in ((first, second), (first, first), (second, second))
-    ]
     with np.errstate(invalid="ignore", divide="ignore"):
-        return products[0] / np.sqrt(products[1] * products[2])
+        both, left, right = ((times * product).sum(axis=1) for product in (first * second, first**2, second**2))
+        return both / np.sqrt(left * right)
 
 
 def _ranks(values: NDArray, times: NDArray) -> NDArray:
@@ -146,10 +139,6 @@ def _ranks(values: NDArray, times: NDArray) -> NDArray:
     return (np.cumsum(together, axis=1) - together / 2)[:, place]
 
 
-PREDICTORS = ("visibility", "coverage")
-"""What may predict PSNR."""
-
-
 @dataclass(frozen=True)
 class Point:
     """One reconstruction."""
@@ -158,7 +147,7 @@ class Point:
     rollout: tuple[str, str, int, int]
     """Method, scene, seed and start."""
     whole: bool
-    """Whether it was made of all frames of its episode."""
+    """Of all frames of its episode."""
     shares: Mapping[str, float]
     """Of the held-out pixels (`visibility`) and of the navigable cells (`coverage`) that its frames have seen."""
     psnr: float

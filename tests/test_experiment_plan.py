@@ -1,6 +1,5 @@
 import json
-import shutil
-from collections import Counter, namedtuple
+from collections import Counter
 from dataclasses import replace
 from itertools import groupby
 
@@ -208,16 +207,6 @@ def test_an_unreadable_scene_is_named(tmp_path, monkeypatch, capsys):
     code, line = refused(capsys, "--preset", "smoke", "--scene", "builtin:0,broken.glb")
     assert code == 1
     assert "broken.glb" in line
-
-
-def test_a_disk_that_is_too_small_is_refused_with_the_estimate(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10**9, 10**9 - 10**7, 10**7))
-    code, line = refused(capsys, "--preset", "smoke", "--out", "e")
-    assert code == 1
-    assert "need about" in line
-    assert "10 MB are free" in line
 
 
 def test_a_second_program_in_the_same_folder_is_refused(tmp_path):

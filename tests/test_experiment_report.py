@@ -331,21 +331,21 @@ BAD = {
         "expected results of format 1, found 'list'",
     ),
     "another format": (lambda folder: spoiled(folder, lambda v: v.update(format=2)), 1, "format 1, found 2"),
-    "no rollouts": (lambda folder: spoiled(folder, lambda v: v.pop("rollouts")), 1, "rollouts: missing or damaged"),
+    "no rollouts": (lambda folder: spoiled(folder, lambda v: v.pop("rollouts")), 1, "results.json: missing or damaged"),
     "half a rollout": (
         lambda folder: spoiled(folder, lambda v: v["rollouts"][2].pop("metrics")),
         1,
-        r"rollouts: missing or damaged: KeyError('metrics')",
+        "results.json: missing or damaged: KeyError('metrics')",
     ),
     "a text for a number": (
         lambda folder: spoiled(folder, lambda v: v["reconstructions"][0].update(frames="many")),
         1,
-        "reconstructions: missing or damaged",
+        "results.json: missing or damaged",
     ),
     "a damaged map": (
         lambda folder: spoiled(folder, lambda v: v["rollouts"][0]["map"].update(floor="####")),
         1,
-        "a map of the results cannot be read",
+        "results.json: missing or damaged",
     ),
 }
 

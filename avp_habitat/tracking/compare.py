@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import sys
 import tempfile
 from collections import defaultdict
@@ -10,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
-from urllib.parse import urlsplit
 
 from tyro.conf import UseAppendAction, arg
 
@@ -28,18 +26,8 @@ from avp_habitat.metrics import (
     mean_and_half_width,
 )
 from avp_habitat.tables import table
-from avp_habitat.tracking import names
-from avp_habitat.tracking.experiments import DEFAULT_HELP, chosen_experiment, find_experiment
-from avp_habitat.tracking.stores import (
-    ADDRESS_HELP,
-    DEFAULT_ADDRESS,
-    TrackingError,
-    address_of,
-    connect,
-    first_line,
-    how_to_look,
-    shown,
-)
+from avp_habitat.tracking import names, stores
+from avp_habitat.tracking.experiments import DEFAULT_HELP, chosen_experiment, find_experiment, search_tags
 from avp_habitat.tracking.view import MODEL_TRAINING, prepare_experiment, run_colour
 
 if TYPE_CHECKING:
@@ -71,27 +59,13 @@ class ComparedMethod:
     further: tuple[Figure, ...] = ()
     """A user's metrics among them."""
 
-    def cells(self, shown: Sequence[Figure]) -> list[str]:
-        """The row, with these figures."""
-        known, halves = self.means, self.halves
-        texts = [
-            one.text(known[one.name], halves.get(one.name, math.nan)) if one.name in known else "–" for one in shown
-        ]
-        return [self.policy, self.scene, self.method, str(self.runs), *texts]
-
 
 def compare(client: "MlflowClient", experiment_id: str, metrics: Sequence[str] = ()) -> list[ComparedMethod]:
     """What an experiment's reconstructions, rollouts and evaluations (of its first 50,000 runs) say of each method.
 
-    Args:
-        client: of the store.
-        experiment_id: where to look.
-        metrics: of the user, for those that no distribution registers.
-
-    Returns:
-        Rows by scene; within it those with a reconstruction first, the best PSNR at the top, then by coverage.
+    Rows by scene; within it those with a reconstruction first, the best PSNR at the top, then by coverage. `metrics`
+    are the user's that no distribution registers.
     """
-    known = figures(metrics)
     found = client.search_runs([experiment_id], "metrics.`eval/coverage` >= 0", max_results=_MOST_RUNS)
     # A reconstruction carries the figures of its rollout, which would otherwise count twice.
     rollouts = {run.data.tags.get(names.ROLLOUT_RUN_TAG) for run in found}
@@ -104,14 +78,15 @@ def compare(client: "MlflowClient", experiment_id: str, metrics: Sequence[str] =
         if told and tags.get(names.KIND_TAG) != names.COMPARISON and run.info.run_id not in rollouts:
             method = tags.get(names.METHOD_TAG) or tags.get(names.KIND_TAG) or names.EVALUATION
             groups[tags[names.POLICY_TAG], tags.get(names.SCENE_TAG, "?"), method].append(logged)
-    return sorted((_method(*key, group, known) for key, group in groups.items()), key=_rank)
+    added = [figure for name, figure in figures(metrics).items() if name not in FIGURES]
+    return sorted((_method(*key, group, added) for key, group in groups.items()), key=_rank)
 
 
 def _method(
-    policy: str, scene: str, method: str, runs: Sequence[Mapping[str, float]], known: Mapping[str, Figure]
+    policy: str, scene: str, method: str, runs: Sequence[Mapping[str, float]], added: Sequence[Figure]
 ) -> ComparedMethod:
-    means, halves = {}, {}
-    for name in [figure.name for figure in _ALWAYS] + [name for name in known if name not in FIGURES]:
+    means, halves = {}, {"cpv": math.nan}
+    for name in [figure.name for figure in (*_ALWAYS, *added) if figure.name != "cpv"]:
         values = [run[f"eval/{name}"] for run in runs if f"eval/{name}" in run]
         if values:
             mean, half = mean_and_half_width(values)
@@ -120,20 +95,23 @@ def _method(
             halves[name] = float(half) if len(values) > 1 else runs[0].get(f"eval/{name}_ci95", math.nan)
     coverages, views = ([run[name] for run in runs] for name in ("eval/coverage", "eval/views"))
     means["cpv"] = coverage_per_view(coverages, views)  # type: ignore[arg-type]
-    further = tuple(figure for name, figure in known.items() if name not in FIGURES and name in means)
-    return ComparedMethod(policy, scene, method, len(runs), means, {**halves, "cpv": math.nan}, further)
+    further = tuple(figure for figure in added if figure.name in means)
+    return ComparedMethod(policy, scene, method, len(runs), means, halves, further)
 
 
-def _rank(method: ComparedMethod) -> tuple[Any, ...]:
-    psnr = method.means.get("psnr", -math.inf)
-    return method.scene, -psnr, -method.means["coverage"], method.policy, method.method
+def _rank(one: ComparedMethod) -> tuple[Any, ...]:
+    return one.scene, -one.means.get("psnr", -math.inf), -one.means["coverage"], one.policy, one.method
 
 
 def rows(methods: Sequence[ComparedMethod]) -> tuple[list[str], list[list[str]]]:
     """Head and rows of the table; a user's metric has a column where a run has it."""
     shown = list(dict.fromkeys([*_ALWAYS, *(figure for method in methods for figure in method.further)]))
-    head = ["policy", "scene", "method", "runs", *(figure.heading for figure in shown)]
-    return head, [method.cells(shown) for method in methods]
+    found = []
+    for one in methods:
+        known, halves = one.means, one.halves
+        texts = (each.text(known[each.name], halves[each.name]) if each.name in known else "–" for each in shown)
+        found.append([one.policy, one.scene, one.method, str(one.runs), *texts])
+    return ["policy", "scene", "method", "runs", *(figure.heading for figure in shown)], found
 
 
 def markdown(methods: Sequence[ComparedMethod]) -> str:
@@ -141,46 +119,38 @@ def markdown(methods: Sequence[ComparedMethod]) -> str:
     return table(*rows(methods)) + "\n"
 
 
-def picture(methods: Sequence[ComparedMethod], path: Path) -> bool:
-    """Draw PSNR against views, one point per method; False where none has a reconstruction."""
+def picture(methods: Sequence[ComparedMethod], path: Path) -> None:
+    """Draw PSNR against views, one point per method, where one has a reconstruction."""
     from matplotlib.figure import Figure as Drawing
 
     drawn = [method for method in methods if "psnr" in method.means]
     if not drawn:
-        return False
+        return
     drawing = Drawing(figsize=(6.4, 4), layout="constrained")
     axes = drawing.subplots()
     for method in drawn:
         # What tells a row from the others.
         parts = [name for name in ("scene", "method") if len({getattr(other, name) for other in drawn}) > 1]
         told = ", ".join(getattr(method, name) for name in parts)
-        axes.errorbar(
-            *(method.means["views"], method.means["psnr"]),
-            *(method.halves["psnr"], method.halves["views"]),
-            **{"fmt": "o", "capsize": 3, "color": run_colour(method.policy)},
-            label=f"{method.policy} ({told})" if told else method.policy,
-        )
+        look = {"fmt": "o", "capsize": 3, "color": run_colour(method.policy)}
+        look["label"] = f"{method.policy} ({told})" if told else method.policy
+        means, halves = method.means, method.halves
+        axes.errorbar(means["views"], means["psnr"], halves["psnr"], halves["views"], **look)
     axes.set(xlabel="views (fewer is better)", ylabel="PSNR [dB] on held-out views", title="up and left is better")
     axes.margins(0.12)
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
     drawing.savefig(path, dpi=120)
-    return True
 
 
 def keep(client: "MlflowClient", experiment_id: str, methods: Sequence[ComparedMethod]) -> str:
-    """Make or renew the run that compares these methods, one for each set of scenes; its id.
-
-    Raises:
-        MlflowException: the store refuses.
-    """
-    tags = {
-        names.KIND_TAG: names.COMPARISON,
-        names.SCENE_TAG: ", ".join(sorted({method.scene for method in methods}))[: names.MAX_TAG],
-    }
-    of_kind = client.search_runs([experiment_id], f"tags.`{names.KIND_TAG}` = '{names.COMPARISON}'")
-    kept = [run for run in of_kind if run.data.tags.get(names.SCENE_TAG) == tags[names.SCENE_TAG]]
-    run = kept[0] if kept else client.create_run(experiment_id, run_name=names.COMPARISON, tags=tags)
+    """Make or renew the run that compares these methods, one for each set of scenes; its id."""
+    scenes = ", ".join(sorted({method.scene for method in methods}))[: names.MAX_TAG]
+    kept = search_tags(client, {names.KIND_TAG: names.COMPARISON}, experiment_id)
+    run = next((run for run in kept if run.data.tags.get(names.SCENE_TAG) == scenes), None)
+    if run is None:
+        tags = {names.KIND_TAG: names.COMPARISON, names.SCENE_TAG: scenes}
+        run = client.create_run(experiment_id, run_name=names.COMPARISON, tags=tags)
     run_id = run.info.run_id
     try:
         client.log_dict(run_id, dict(zip(("columns", "data"), rows(methods), strict=True)), TABLE)
@@ -188,8 +158,7 @@ def keep(client: "MlflowClient", experiment_id: str, methods: Sequence[ComparedM
         client.set_tag(run_id, "mlflow.loggedArtifacts", json.dumps([{"path": TABLE, "type": "table"}]))
         with tempfile.TemporaryDirectory() as folder:
             _write(Path(folder), methods)
-            for path in Path(folder).iterdir():
-                client.log_artifact(run_id, os.fspath(path))
+            client.log_artifacts(run_id, folder)
         # The page shows it above everything else.
         client.set_tag(run_id, names.NOTE_TAG, (markdown(methods) + _HOW_TO_READ)[: names.MAX_TAG])
     finally:
@@ -210,7 +179,7 @@ class CompareRuns:
     """
 
     experiment: Annotated[str | None, arg(help=f"Of MLflow (omitted: {DEFAULT_HELP}).")] = None
-    mlflow: Annotated[str, arg(help=ADDRESS_HELP)] = "auto"
+    mlflow: Annotated[str, arg(help=stores.ADDRESS_HELP)] = "auto"
     scene: UseAppendAction[tuple[str, ...]] = ()
     """Only this scene; give it again for more."""
     metrics: Annotated[tuple[str, ...], arg(help=f"{METRICS_HELP}; registered ones are shown without")] = ()
@@ -228,45 +197,39 @@ def main(options: CompareRuns) -> None:
     """Collect, compare, print, keep."""
     from mlflow.exceptions import MlflowException
 
-    address = str(address_of(options.mlflow, default=DEFAULT_ADDRESS))
+    address = str(stores.address_of(options.mlflow, default=stores.DEFAULT_ADDRESS))
     if options.out is not None:
         check_new(options.out, option="--out")
-    client = connect(address)
+    client = stores.connect(address)
     try:
-        experiment = _experiment(client, options.experiment)
+        experiment = find_experiment(client, *(chosen := chosen_experiment(options.experiment)))
+        if experiment is None:
+            known = [one.name for one in client.search_experiments()]
+            raise UsageError(f"--experiment: {unknown_name('experiment', str(chosen[0]), known)}")
         methods = _methods(client, experiment, options)
         print(markdown(methods))
         run = keep(client, experiment.experiment_id, methods)
         prepare_experiment(client, experiment.experiment_id)
     except MlflowException as error:
-        raise TrackingError(f"MLflow at {shown(address)} does not answer: {first_line(error)}") from None
+        problem = f"does not answer: {stores.first_line(error)}"
+        raise stores.TrackingError(f"MLflow at {stores.shown(address)} {problem}") from None
     if options.out is not None:
         with atomic_folder(options.out, failure=UsageError, option="--out") as folder:
             _write(folder, methods)
         print(f"files:   {options.out}")
-    page = f"#/experiments/{experiment.experiment_id}/runs/{run}?{MODEL_TRAINING}"
-    served = urlsplit(address).scheme in ("http", "https")
-    there = f"{how_to_look(address).rstrip('/')}/" if served else f"{how_to_look(address)}, then http://127.0.0.1:5000/"
-    print(f"MLflow:  run {run} in experiment {experiment.name!r} at {shown(address)}")
-    print(f"look:    {there}{page}")
-
-
-def _experiment(client: "MlflowClient", option: str | None) -> "Experiment":
-    name, identity = chosen_experiment(option)
-    found = find_experiment(client, name, identity)
-    if found is None:
-        known = [experiment.name for experiment in client.search_experiments()]
-        raise UsageError(f"--experiment: {unknown_name('experiment', str(name), known)}")
-    return found
+    there = stores.how_to_look(address)
+    there = there.rstrip("/") if address.startswith("http") else f"{there}, then http://127.0.0.1:5000"
+    print(f"MLflow:  run {run} in experiment {experiment.name!r} at {stores.shown(address)}")
+    print(f"look:    {there}/#/experiments/{experiment.experiment_id}/runs/{run}?{MODEL_TRAINING}")
 
 
 def _methods(client: "MlflowClient", experiment: "Experiment", options: CompareRuns) -> list[ComparedMethod]:
     methods = compare(client, experiment.experiment_id, options.metrics)
     if not methods:
         raise AVPError(
-            f"experiment {experiment.name!r} at {shown(client.tracking_uri)} has no run with eval/coverage, eval/views "
-            "and the tag avp.policy; such runs are made by python -m avp_sb3.evaluate, ns-train avp-nerfacto and "
-            "python -m avp_nerfstudio.log"
+            f"experiment {experiment.name!r} at {stores.shown(client.tracking_uri)} has no run with eval/coverage, "
+            "eval/views and the tag avp.policy; such runs are made by python -m avp_sb3.evaluate, ns-train "
+            "avp-nerfacto and python -m avp_nerfstudio.log"
         )
     known = {method.scene for method in methods}
     for scene in options.scene:

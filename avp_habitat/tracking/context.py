@@ -8,9 +8,9 @@ from mlflow.tracking.context.abstract_context import RunContextProvider
 
 from avp_habitat.provenance import PACKAGES, git_commit, installed_versions
 from avp_habitat.simulators.registry import open_scenes
+from avp_habitat.tracking.names import MAX_TAG
 
 _USERS = ("avp_habitat.task.env", "avp_sb3", "avp_nerfstudio")
-_MAX_TAG = 5000
 
 
 class AVPContext(RunContextProvider):
@@ -23,14 +23,11 @@ class AVPContext(RunContextProvider):
     def tags(self) -> dict[str, str]:
         """The tags."""
         tags = {f"version.{name}": version for name, version in installed_versions(PACKAGES).items()}
-        tags |= {
-            "system.platform": platform.platform(),
-            "system.processor": platform.processor() or platform.machine(),
-            "system.cores": str(os.cpu_count()),
-        }
+        tags |= {"system.platform": platform.platform(), "system.cores": str(os.cpu_count())}
+        tags |= {"system.processor": platform.processor() or platform.machine()}
         if (commit := git_commit()) is not None:
             tags["mlflow.source.git.commit"] = commit
         if scenes := open_scenes():
-            tags["avp.scene"] = ", ".join(scenes)[:_MAX_TAG]
-            tags["avp.scene_digest"] = ", ".join(scenes.values())[:_MAX_TAG]
+            tags["avp.scene"] = ", ".join(scenes)[:MAX_TAG]
+            tags["avp.scene_digest"] = ", ".join(scenes.values())[:MAX_TAG]
         return tags

@@ -21,21 +21,13 @@ _log = logging.getLogger(__name__)
 
 def left_journals(spool: Path) -> Iterator[Journal]:
     """The journals that no living process holds; each is to be closed before the next is taken."""
-    for folder in headers(spool):
-        if (journal := Journal.adopt(folder)) is not None:
-            yield journal
+    return filter(None, map(Journal.adopt, headers(spool)))
 
 
-def finish(journal: Journal, *, again: bool = False, timeout_s: float = 30.0) -> tuple[bool, str]:
-    """Send what a left journal holds, `again` also what MLflow refused, and close its run, if need be as KILLED.
-
-    Returns:
-        Whether MLflow has everything, so that the journal is gone; and a line that says so.
-    """
+def finish(journal: Journal, *, timeout_s: float = 30.0) -> tuple[bool, str]:
+    """Send what a left journal holds and close its run, if need be as KILLED; whether that worked, and a line on it."""
     header, last_ms = journal.header, journal.last_written_ms()
     killed = header["ended"] is None
-    if again:
-        journal.restore_rejected()
     run = TrackedRun(journal, None, uncertain=True, interval_s=0.0)
     delivered = run.close("KILLED" if killed else None, at_ms=last_ms, timeout_s=timeout_s)
     how = f"{header['ended']}{', its program was killed' if killed and header['owned'] else ''}"
@@ -48,8 +40,6 @@ def recover(*, timeout_s: float = 30.0) -> Iterator[str]:
         ended, made = journal.header["ended"] is not None, journal.header["run_id"] is not None
         if journal.pending or (made and not ended):
             yield finish(journal, timeout_s=timeout_s)[1]
-        elif journal.has_rejected:
-            journal.release()  # It waits for somebody who looks at it.
         else:
             journal.remove()
 
@@ -78,8 +68,6 @@ class Deliver:
     """Where they wait (omitted: AVP_MLFLOW_SPOOL, else runs/mlflow-spool)."""
     mlflow: str | None = None
     """Send them to this address instead of where they were meant for."""
-    again: bool = False
-    """Try also what MLflow refused."""
     list: bool = False
     """Only say what waits."""
 
@@ -96,15 +84,15 @@ def main(options: Deliver) -> None:
         for folder, header in waiting.items():
             print(f"{folder.name}  run {header['run_id'] or '(none yet)'}  for {shown(header['address'])}")
     else:
-        _deliver(spool, len(waiting), options)
+        _deliver(spool, len(waiting), options.mlflow)
 
 
-def _deliver(spool: Path, count: int, options: Deliver) -> None:
+def _deliver(spool: Path, count: int, address: str | None) -> None:
     done = []
     for journal in command.progress(left_journals(spool), total=count, unit="run", desc="sending"):
-        if options.mlflow is not None:
-            journal.header["address"] = absolute(options.mlflow)
-        done.append(finish(journal, again=options.again, timeout_s=_PATIENCE_S))
+        if address is not None:
+            journal.header["address"] = absolute(address)
+        done.append(finish(journal, timeout_s=_PATIENCE_S))
     for _, line in done:
         print(line)
     if busy := count - len(done):

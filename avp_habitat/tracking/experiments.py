@@ -19,10 +19,7 @@ _NOT_THERE = ("RESOURCE_DOES_NOT_EXIST", "INVALID_PARAMETER_VALUE")
 
 
 def chosen_experiment(option: str | None) -> tuple[str | None, str | None]:
-    """The name, or else the id, of the experiment that runs go to.
-
-    The option, else what MLflow's variables say, which `mlflow.set_experiment` sets too, else `avp`.
-    """
+    """The name, or else the id, of the experiment that runs go to: the option, else what MLflow's variables say."""
     if option:
         return option, None
     identity = os.environ.get(ID_VARIABLE)
@@ -50,24 +47,15 @@ def find_experiment(client: "MlflowClient", name: str | None, identity: str | No
         raise TrackingError(f"{ID_VARIABLE}={identity}: MLflow at {store} has no such experiment") from None
     if found is not None and found.lifecycle_stage != "active":
         restore = f"MLFLOW_TRACKING_URI={store} mlflow experiments restore --experiment-id {found.experiment_id}"
-        raise TrackingError(
-            f"MLflow experiment {found.name!r} at {store} is deleted; bring it back with: {restore}, or choose "
-            f"another one (option experiment, or {NAME_VARIABLE})"
-        )
+        raise TrackingError(f"MLflow experiment {found.name!r} at {store} is deleted; bring it back with: {restore}")
     return found
 
 
 def experiment_id(client: "MlflowClient", name: str | None, identity: str | None = None) -> str:
-    """The id of the experiment of a name or an id, which is made, with its views, when there is none of that name.
-
-    Raises:
-        TrackingError: as `find_experiment`.
-        MlflowException: the store refuses.
-    """
+    """As `find_experiment`, the id; of a name that is not there the experiment is made, with its views."""
     from mlflow.exceptions import MlflowException
 
-    found = find_experiment(client, name, identity)
-    if found is not None:
+    if (found := find_experiment(client, name, identity)) is not None:
         return found.experiment_id
     try:
         made = client.create_experiment(str(name))
@@ -98,13 +86,8 @@ def find_run(client: "MlflowClient", run_id: str | None) -> "Run | None":
 
 
 def existing_run(client: "MlflowClient", run_id: str) -> "Run":
-    """The run of an id.
-
-    Raises:
-        TrackingError: there is none.
-    """
-    run = find_run(client, run_id)
-    if run is None:
+    """As `find_run`, but a run that is not there is a `TrackingError`."""
+    if (run := find_run(client, run_id)) is None:
         raise TrackingError(f"MLflow run {run_id}: expected a run at {shown(client.tracking_uri)}, found none")
     return run
 
@@ -117,8 +100,7 @@ def search_tags(client: "MlflowClient", tags: Mapping[str, str], home: str | Non
 
 def create_run(client: "MlflowClient", header: Mapping[str, Any]) -> str:
     """The id of the run of a journal with this header, which is made when the store has none for its key."""
-    earlier = find_run(client, f"{OFFLINE}{header['key']}")
-    if earlier is not None:
+    if (earlier := find_run(client, f"{OFFLINE}{header['key']}")) is not None:
         return earlier.info.run_id
     identity = experiment_id(client, header["experiment"], header.get("experiment_id"))
     tags = {**header["tags"], KEY_TAG: header["key"]}

@@ -1,9 +1,9 @@
 """What a run still has to tell MLflow, kept on disk until MLflow has it.
 
 A journal is a folder: `run.json` (which run, where), `journal.jsonl` (one entry per line), `sent` (how much of it
-MLflow has), `files/` (artifacts), `rejected.jsonl` (what MLflow refuses), and `lock`, held by the process that
-writes. Every entry is one `write` to the system, so a process that is killed loses none; losing the machine may lose
-the last ones. Entries that the disk does not take wait in memory until it does.
+MLflow has), `files/` (artifacts), and `lock`, held by the process that writes. Every entry is one `write` to the
+system, so a process that is killed loses none; losing the machine may lose the last ones. Entries that the disk does
+not take wait in memory until it does.
 """
 
 import fcntl
@@ -12,19 +12,19 @@ import os
 import shutil
 import threading
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from avp_habitat.files import atomic_file
 from avp_habitat.tracking.names import OFFLINE
 from avp_habitat.tracking.stores import TrackingError
 
 SPOOL_VARIABLE = "AVP_MLFLOW_SPOOL"
 VERSION = 1
-_HEADER, _ENTRIES, _SENT, _LOCK, _REJECTED = "run.json", "journal.jsonl", "sent", "lock", "rejected.jsonl"
-_KEYS = {"key", "address", "run_id", "owned", "ended", "started_ms"}
+_HEADER, _ENTRIES, _SENT, _LOCK = "run.json", "journal.jsonl", "sent", "lock"
 _CHUNK, _COMPACT = 1 << 20, 4 << 20
 # A POSIX lock goes when its process closes any descriptor of the file, so nobody here may open one of our own again.
 _ours: set[Path] = set()
@@ -36,7 +36,7 @@ def spool_folder() -> Path:
 
 
 def headers(spool: Path) -> dict[Path, dict[str, Any]]:
-    """The headers of all journals of a folder, in use or left by their processes."""
+    """The headers of all journals of a folder, in use or left."""
     return {path: header for path in sorted(spool.glob("*")) if (header := Journal.peek(path)) is not None}
 
 
@@ -51,8 +51,7 @@ class Journal:
 
     def __init__(self, folder: Path, header: Mapping[str, Any]) -> None:
         """Use `create` or `adopt`."""
-        self.folder = folder
-        self.header = dict(header)
+        self.folder, self.header = folder, dict(header)
         self._lock = threading.Condition()
         self._waiting: deque[dict[str, Any]] = deque()
         self._descriptors: list[int] = []
@@ -75,21 +74,18 @@ class Journal:
             journal._write_header()
         except OSError as error:
             journal.remove()
-            reason = f"{journal.folder}: cannot be written: {error.strerror or error}"
-            raise TrackingError(
-                f"{reason}; MLflow's points are kept there, name another folder in {SPOOL_VARIABLE}"
-            ) from None
+            problem = f"cannot be written: {error.strerror or error}; MLflow's points are kept there"
+            raise TrackingError(f"{journal.folder}: {problem}, name another folder in {SPOOL_VARIABLE}") from None
         return journal
 
     @classmethod
     def peek(cls, folder: Path) -> dict[str, Any] | None:
-        """Which run a folder is the journal of, in use or not; None when it is none that we can read."""
+        """The header of a folder's journal, in use or not; None when it is none that we can read."""
         try:
             header = json.loads((folder / _HEADER).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return None
-        whole = isinstance(header, dict) and header.get("version") == VERSION and header.keys() >= _KEYS
-        return header if whole else None
+        return header if isinstance(header, dict) and header.get("version") == VERSION else None
 
     @classmethod
     def adopt(cls, folder: Path) -> "Journal | None":
@@ -133,13 +129,15 @@ class Journal:
             if self._sent == self._size:
                 self._read_to, self._read_waiting = self._sent, len(self._waiting)
                 return list(self._waiting)
-            data = os.pread(self._file, min(_CHUNK, self._size - self._sent), self._sent)
-            # A line longer than a chunk is read whole.
-            while b"\n" not in data:
-                data += os.pread(self._file, _CHUNK, self._sent + len(data))
-            data = data[: data.rindex(b"\n") + 1]
+            with (self.folder / _ENTRIES).open("rb") as file:
+                file.seek(self._sent)
+                data = b"".join(file.readlines(_CHUNK))[: self._size - self._sent]
             self._read_to, self._read_waiting = self._sent + len(data), 0
-            return list(_parsed(data))
+            entries = []
+            for line in data.splitlines():
+                with suppress(ValueError):  # Losing the machine may leave a damaged one.
+                    entries.append(json.loads(line))
+            return entries
 
     def acknowledge(self) -> None:
         """Note that MLflow has what `read` gave last."""
@@ -163,30 +161,8 @@ class Journal:
         with self._lock:
             return self._lock.wait_for(lambda: self.pending == pending, timeout_s)
 
-    def reject(self, entry: Mapping[str, Any], reason: str) -> None:
-        """Keep an entry that MLflow refuses, with its reason, beside the others."""
-        with suppress(OSError), (self.folder / _REJECTED).open("a", encoding="utf-8") as file:
-            file.write(json.dumps({**entry, "reason": reason}) + "\n")
-
-    def restore_rejected(self) -> None:
-        """Put refused entries back, to be tried again."""
-        if self.has_rejected:
-            path = self.folder / _REJECTED
-            for entry in _parsed(path.read_bytes()):
-                self.append({key: value for key, value in entry.items() if key != "reason"})
-            path.unlink()
-
-    @property
-    def has_rejected(self) -> bool:
-        """Whether MLflow refused something."""
-        return (self.folder / _REJECTED).is_file()
-
     def new_file(self, name: str) -> Path:
-        """Where to write a file that an entry will name.
-
-        Raises:
-            OSError: the disk does not take it.
-        """
+        """Where to write a file that an entry will name; an `OSError` where the disk does not take it."""
         home = self.folder / "files" / uuid4().hex
         home.mkdir(parents=True)
         return home / name
@@ -211,7 +187,8 @@ class Journal:
         fcntl.lockf(self._descriptor(_LOCK), fcntl.LOCK_EX | fcntl.LOCK_NB)
         _ours.add(self.folder)
         self._file, self._mark = self._descriptor(_ENTRIES), self._descriptor(_SENT)
-        self._size = _whole_lines(self._file)
+        # An incomplete last line, which only losing the machine leaves, is overwritten.
+        self._size = (self.folder / _ENTRIES).read_bytes().rfind(b"\n") + 1
         sent = os.pread(self._mark, 32, 0).strip()
         self._sent = int(sent) if sent.isdigit() and int(sent) <= self._size else 0
         self._mark_sent()
@@ -221,9 +198,8 @@ class Journal:
         return self._descriptors[-1]
 
     def _write_header(self) -> None:
-        new = self.folder / "run.new"
-        new.write_text(json.dumps(self.header, indent=1) + "\n", encoding="utf-8")
-        new.rename(self.folder / _HEADER)
+        with atomic_file(self.folder / _HEADER) as partial:
+            partial.write_text(json.dumps(self.header, indent=1) + "\n", encoding="utf-8")
 
     def _write_waiting(self) -> None:
         while self._waiting:
@@ -232,8 +208,6 @@ class Journal:
                 if os.pwrite(self._file, line, self._size) < len(line):
                     raise OSError(None, "the disk is full")
             except OSError as error:
-                with suppress(OSError):
-                    os.ftruncate(self._file, self._size)
                 self.problem = f"{self.folder}: {error.strerror or error}"
                 return
             self.problem = None
@@ -244,20 +218,3 @@ class Journal:
         # Always the same bytes in place, which needs no space on a full disk.
         with suppress(OSError):
             os.pwrite(self._mark, f"{self._sent:020d}\n".encode(), 0)
-
-
-def _whole_lines(file: int) -> int:
-    """The file's size after an incomplete last line, which only losing the machine leaves, is cut off."""
-    size = end = os.fstat(file).st_size
-    while end > 0 and os.pread(file, 1, end - 1) != b"\n":
-        end -= 1
-    if end != size:
-        os.ftruncate(file, end)
-    return end
-
-
-def _parsed(data: bytes) -> Iterator[dict[str, Any]]:
-    """The entries of some lines; a damaged one, which only losing the machine leaves, is left out."""
-    for line in data.splitlines():
-        with suppress(ValueError):
-            yield json.loads(line)

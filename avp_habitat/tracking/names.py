@@ -1,5 +1,6 @@
 """Names of the tags that runs and experiments have, and names and lengths that MLflow takes."""
 
+import itertools
 import re
 
 KIND_TAG = "avp.kind"
@@ -14,8 +15,7 @@ KEY_TAG, RENAMED_TAG, CHANGED_TAG = "avp.key", "avp.renamed", "avp.changed_param
 VIEWS_TAG = "avp.views"
 """Of an experiment whose page has been prepared."""
 PARENT_TAG, NOTE_TAG, COLOUR_TAG = "mlflow.parentRunId", "mlflow.note.content", "mlflow.runColor"
-COMMIT_TAG, IMAGES_TAG = "mlflow.source.git.commit", "mlflow.loggedImages"
-VIEW_TAG, PAGE_TAG = "mlflow.sharedViewState.", "mlflow.experimentKind"
+IMAGES_TAG, VIEW_TAG, PAGE_TAG = "mlflow.loggedImages", "mlflow.sharedViewState.", "mlflow.experimentKind"
 
 ROLLOUT, RECONSTRUCTION, COMPARISON, EVALUATION = "rollout", "reconstruction", "comparison", "evaluation"
 """Values of `avp.kind`."""
@@ -30,8 +30,7 @@ _BRACKETS, _UNSAFE = re.compile(r"[()\[\]{}]"), re.compile(r"[^\w.\- /]")
 def safe_name(name: str) -> str:
     """A name that MLflow takes on every system and with every store.
 
-    Brackets go, characters other than letters, digits, `_ . -`, space and `/` become `_`; empty and dotted path
-    parts, which MLflow would resolve like a file path, go.
+    Brackets go, and empty and dotted parts of a path; what is no letter, digit, `_ . -`, space or `/` becomes `_`.
     """
     parts = (part.strip() for part in _UNSAFE.sub("_", _BRACKETS.sub("", name)).split("/"))
     return "/".join(part for part in parts if part not in ("", ".", ".."))[:MAX_NAME].rstrip("/ ") or "_"
@@ -42,13 +41,10 @@ class SafeNames(dict[str, str]):
 
     def __missing__(self, name: str) -> str:
         """Choose one, with a number where it is taken."""
-        safe = candidate = safe_name(name)
-        count = 1
-        while candidate in self.values():
-            count += 1
-            candidate = f"{safe[: MAX_NAME - 4]} {count}"
-        self[name] = candidate
-        return candidate
+        safe = safe_name(name)
+        numbered = (f"{safe[: MAX_NAME - 4]} {count}" for count in itertools.count(2))
+        self[name] = next(one for one in itertools.chain([safe], numbered) if one not in self.values())
+        return self[name]
 
     @property
     def changed(self) -> dict[str, str]:

@@ -12,31 +12,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from avp_habitat import command
-from avp_habitat.errors import AVPError, RolloutError, UsageError
+from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.provenance import flat
 from avp_habitat.rollout.format import Rollout, read_rollout
-from avp_habitat.tracking import names
+from avp_habitat.tracking import names, stores
 from avp_habitat.tracking.experiments import DEFAULT_HELP, chosen_experiment, experiment_id, find_run, search_tags
 from avp_habitat.tracking.names import safe_name
-from avp_habitat.tracking.stores import (
-    ADDRESS_HELP,
-    DEFAULT_ADDRESS,
-    TrackingError,
-    address_of,
-    connect,
-    first_line,
-    how_to_look,
-    locked,
-    shown,
-)
 from avp_habitat.tracking.view import run_colour
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Run
 
-_ARTIFACTS = ("trajectory.png", "rollout.json", "steps.csv")
 _IDENTITY = ("rollout.json", "steps.csv")
+_ARTIFACTS = ("trajectory.png", *_IDENTITY)
 _SETTINGS = ("policy", "seed", "reward", "budget", "counts", "heldout", "created")
 _ORIGIN = {
     names.SCENE_TAG: "scene.name",
@@ -50,36 +39,38 @@ def rollout_run(store: "MlflowClient | str", folder: str | Path, *, experiment: 
     """The id of the MLflow run of a rollout, which is made when the store has none.
 
     A rollout is recognised by its contents (`rollout_id`), wherever its folder lies. Its run is a child of the run
-    that trained the policy, in the experiment of that; or else in that of `experiments.chosen_experiment`.
-
-    Args:
-        store: its client, or its address.
-        folder: of the rollout, or its `rollout.json`.
-        experiment: of a rollout whose policy's run the store does not have.
+    that trained the policy, in the experiment of that; or else in `experiments.chosen_experiment(experiment)`.
 
     Raises:
         RolloutError: the rollout cannot be read.
         TrackingError: the store cannot be reached or refuses.
     """
+    from mlflow.exceptions import MlflowException
+
     rollout = read_rollout(folder)
-    client = connect(store) if isinstance(store, str) else store
+    client = stores.connect(store) if isinstance(store, str) else store
+    tags = _tags(rollout)
+    same = {name: tags[name] for name in (names.ROLLOUT_ID_TAG, names.KIND_TAG)}
     try:
-        tags = _tags(rollout)
         # A handful of locks is enough, and leaves only a handful of files behind.
-        with locked(f"rollout-{tags[names.ROLLOUT_ID_TAG][0]}"):
-            policy = find_run(client, tags.get(names.POLICY_RUN_TAG))
-            run = _found(client, tags)
+        with stores.locked(f"rollout-{tags[names.ROLLOUT_ID_TAG][0]}"):
+            policy = find_run(client, policy_run_id(rollout.folder, rollout.meta))
+            run = next(iter(search_tags(client, same)), None)
             if run is None:
-                run = _made(client, rollout, tags, policy, experiment)
-            elif run.info.status != "FINISHED":
+                home = policy.info.experiment_id if policy else experiment_id(client, *chosen_experiment(experiment))
+                named = title(rollout.meta)
+                name = rollout.folder.resolve().name if named is None else f"{names.ROLLOUT} {named}"
+                run = client.create_run(home, run_name=name, tags=tags)
+            if run.info.status != "FINISHED":
                 _fill(client, run, rollout)
-            _tie(client, run, tags, policy)
-    except AVPError:
-        raise
-    except Exception as error:
-        there = shown(client.tracking_uri)
-        text = f"MLflow at {there} did not take the rollout {rollout.folder}: {first_line(error)}"
-        raise TrackingError(text) from error
+            # A policy's run that was kept offline comes later. MLflow nests runs within one experiment only.
+            if policy and policy.info.experiment_id == run.info.experiment_id and names.PARENT_TAG not in run.data.tags:
+                for tag in (names.PARENT_TAG, names.POLICY_RUN_TAG):
+                    client.set_tag(run.info.run_id, tag, policy.info.run_id)
+    except (MlflowException, OSError, ValueError) as error:
+        there = stores.shown(client.tracking_uri)
+        text = f"MLflow at {there} did not take the rollout {rollout.folder}: {stores.first_line(error)}"
+        raise stores.TrackingError(text) from error
     return run.info.run_id
 
 
@@ -95,8 +86,7 @@ def rollout_id(folder: Path) -> str:
             # Each with its own digest, so that nothing can move from one file to the other unseen.
             digest.update(hashlib.sha256((folder / name).read_bytes()).digest())
         except OSError as error:
-            found = "found none" if isinstance(error, FileNotFoundError) else error.strerror
-            raise RolloutError(f"{folder / name}: expected this file of the rollout, {found}") from None
+            raise RolloutError(f"{folder / name}: expected this file of the rollout: {error.strerror}") from None
     return digest.hexdigest()
 
 
@@ -110,12 +100,11 @@ def origin(meta: Mapping[str, Any]) -> dict[str, str]:
 
 def title(meta: Mapping[str, Any]) -> str | None:
     """Policy, scene and seed by `rollout.json`, also the reward of a model; None where a rollout has no names."""
-    named = origin(meta)
-    if not {names.POLICY_TAG, names.SCENE_TAG} <= named.keys():
+    policy, scene = (origin(meta).get(name) for name in (names.POLICY_TAG, names.SCENE_TAG))
+    if policy is None or scene is None:
         return None
-    policy, seed = named[names.POLICY_TAG], meta.get("seed")
-    reward = meta.get("reward") if policy.endswith(".zip") else None
-    words = [policy, reward, named[names.SCENE_TAG], None if seed is None else f"seed {seed}"]
+    reward, seed = meta.get("reward") if policy.endswith(".zip") else None, meta.get("seed")
+    words = [policy, reward, scene, None if seed is None else f"seed {seed}"]
     return " ".join(str(word) for word in words if word is not None)
 
 
@@ -129,17 +118,13 @@ def figures(meta: Mapping[str, Any], prefix: str = "eval") -> dict[str, float]:
     """`eval/coverage`, `eval/views`, ... by a checked `rollout.json`, as the policy's evaluation names them."""
     found = {name: float(value) for name, value in meta.get("metrics", {}).items()}
     if found.get("views") and "coverage" in found:
-        # One number of the policy's evaluation is written in no rollout, because it follows from two others.
+        # It is written in no rollout, because it follows from two others.
         found.setdefault("cpv", 100 * found["coverage"] / found["views"])
     return {safe_name(f"{prefix}/{name}"): value for name, value in found.items()}
 
 
 def policy_run_id(folder: Path, meta: Mapping[str, Any]) -> str | None:
-    """MLflow run in which the policy of a rollout's `rollout.json` was trained; None for a baseline.
-
-    Raises:
-        RolloutError: what stands there cannot be the id of a run.
-    """
+    """MLflow run in which a rollout's policy was trained; None for a baseline. A `RolloutError` where it is no text."""
     value = meta.get("mlflow_run_id")
     if value is not None and not isinstance(value, str):
         raise RolloutError(f"{folder / 'rollout.json'}: expected mlflow_run_id to be a text or null, found {value!r}")
@@ -153,40 +138,16 @@ def _tags(rollout: Rollout) -> dict[str, str]:
     tags = {name: value for name, value in resolve_tags().items() if not name.startswith("version.")}
     tags |= flat({"version": rollout.meta.get("versions", {})}) | origin(rollout.meta)
     tags |= {names.KIND_TAG: names.ROLLOUT, names.ROLLOUT_TAG: str(rollout.folder)}
-    tags[names.ROLLOUT_ID_TAG] = rollout_id(rollout.folder)
-    if (policy_run := policy_run_id(rollout.folder, rollout.meta)) is not None:
-        tags[names.POLICY_RUN_TAG] = policy_run
+    tags |= {names.ROLLOUT_ID_TAG: rollout_id(rollout.folder)}
+    tags |= {names.POLICY_RUN_TAG: policy} if (policy := policy_run_id(rollout.folder, rollout.meta)) else {}
     return {name: str(value)[: names.MAX_TAG] for name, value in tags.items()}
 
 
-def _found(client: "MlflowClient", tags: Mapping[str, str]) -> "Run | None":
-    """The rollout's run; the oldest, should there be several."""
-    found = search_tags(client, {name: tags[name] for name in (names.ROLLOUT_ID_TAG, names.KIND_TAG)})
-    return min(found, key=lambda run: (run.info.start_time, run.info.run_id), default=None)
-
-
-def _made(
-    client: "MlflowClient", rollout: Rollout, tags: dict[str, str], policy: "Run | None", experiment: str | None
-) -> "Run":
-    home = policy.info.experiment_id if policy else experiment_id(client, *chosen_experiment(experiment))
-    named = title(rollout.meta)
-    name = rollout.folder.resolve().name if named is None else f"{names.ROLLOUT} {named}"
-    ours = client.create_run(home, run_name=name, tags=tags)
-    _fill(client, ours, rollout)
-    # A program on another machine may have made it meanwhile, too.
-    first = _found(client, tags) or ours
-    if first.info.run_id != ours.info.run_id:
-        client.delete_run(ours.info.run_id)
-    return first
-
-
 def _fill(client: "MlflowClient", run: "Run", rollout: Rollout) -> None:
-    """Log what a run does not have already because somebody was killed; end it."""
+    """Log what a run does not have already because a program was killed; end it."""
     from mlflow.entities import Metric, Param
 
-    run_id, has = run.info.run_id, client.get_run(run.info.run_id).data
-    # With one time for whoever fills it, a database takes the same figure twice for the same point.
-    at = run.info.start_time
+    run_id, has, at = run.info.run_id, run.data, run.info.start_time
     metrics, params = figures(rollout.meta), rollout_params(rollout.meta)
     client.log_batch(
         run_id,
@@ -199,31 +160,10 @@ def _fill(client: "MlflowClient", run: "Run", rollout: Rollout) -> None:
     client.set_terminated(run_id, "FINISHED")
 
 
-def _tie(client: "MlflowClient", run: "Run", tags: Mapping[str, str], policy: "Run | None") -> None:
-    """Tie a run to parent and children that came to the store later than it, as runs that were kept offline do."""
-    run_id, home, above = run.info.run_id, run.info.experiment_id, set()
-    if policy is not None:
-        above = {policy.info.run_id, tags[names.POLICY_RUN_TAG]}
-        _replace(client, run, {names.POLICY_RUN_TAG: policy.info.run_id}, above)
-        if policy.info.experiment_id == home:
-            _replace(client, run, {names.PARENT_TAG: policy.info.run_id}, set())
-    identity = {names.ROLLOUT_ID_TAG: tags[names.ROLLOUT_ID_TAG], names.KIND_TAG: names.RECONSTRUCTION}
-    for child in search_tags(client, identity, home):
-        _replace(client, child, {names.PARENT_TAG: run_id, names.ROLLOUT_RUN_TAG: run_id}, above)
-
-
-def _replace(client: "MlflowClient", run: "Run", tags: dict[str, str], old: set[str]) -> None:
-    """Set tags that are missing or have one of the old values; others, which people may have set, stay."""
-    for name, value in tags.items():
-        present = run.data.tags.get(name)
-        if present != value and (present is None or present in old):
-            client.set_tag(run.info.run_id, name, value)
-
-
 def command_for(folder: Path, option: str, experiment: str | None = None) -> str:
     """The command line that logs a rollout; `option` is `auto`, or an address whose password is not repeated."""
     words = ["python", "-m", "avp_habitat.tracking.rollout_run", str(folder)]
-    words += [] if option == "auto" else ["--mlflow", shown(option)]
+    words += [] if option == "auto" else ["--mlflow", stores.shown(option)]
     return shlex.join(words if experiment is None else [*words, "--experiment", experiment])
 
 
@@ -236,10 +176,8 @@ class LogRollouts:
 
     rollouts: Positional[tuple[Path, ...]]
     """Folders of rollouts, or their rollout.json."""
-    mlflow: Annotated[str, arg(help=ADDRESS_HELP)] = "auto"
-    experiment: Annotated[
-        str | None, arg(help=f"MLflow's, of rollouts whose policy's run is not there (omitted: {DEFAULT_HELP})")
-    ] = None
+    mlflow: Annotated[str, arg(help=stores.ADDRESS_HELP)] = "auto"
+    experiment: Annotated[str | None, arg(help=f"Of rollouts without a policy's run (omitted: {DEFAULT_HELP})")] = None
 
     def __post_init__(self) -> None:
         """Refuse what is no place, and no rollouts."""
@@ -251,11 +189,11 @@ class LogRollouts:
 
 def main(options: LogRollouts) -> None:
     """Log rollouts; print their runs."""
-    address = str(address_of(options.mlflow, default=DEFAULT_ADDRESS))
-    client = connect(address)
+    address = str(stores.address_of(options.mlflow, default=stores.DEFAULT_ADDRESS))
+    client = stores.connect(address)
     for folder in options.rollouts:
         print(f"{folder}: MLflow run {rollout_run(client, folder, experiment=options.experiment)}")
-    print(f"look at it: {how_to_look(address)}")
+    print(f"look at it: {stores.how_to_look(address)}")
 
 
 if __name__ == "__main__":

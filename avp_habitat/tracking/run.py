@@ -38,8 +38,8 @@ class TrackedRun:
 
     def __init__(self, journal: Journal, client: "MlflowClient | None", **options: Any) -> None:
         """Fill the run of a journal; options as of `Sender`."""
-        self._journal = journal
-        self._names = SafeNames()
+        self._journal, self._names = journal, SafeNames()
+        self._told: set[str] = set()
         self._sender = Sender(journal, client, **options)
 
     @property
@@ -59,10 +59,9 @@ class TrackedRun:
         points = [[self._names[name], float(value), at, int(step)] for name, value in values.items()]
         if len(self._names) > known and (changed := self._names.changed):
             self.tags({RENAMED_TAG: json.dumps(changed)})
-        for name, value, _, _ in points:
+        for name, value, *_ in points:
             if not math.isfinite(value):
-                text = f"MLflow run {self.run_id}: {name} is {value} at step {step}"
-                self._sender.warn_once(f"value {name}", text)
+                self._warn_once(name, f"MLflow run {self.run_id}: {name} is {value} at step {step}")
         if points:
             self._append({"metrics": points})
 
@@ -82,7 +81,7 @@ class TrackedRun:
             file = self._journal.new_file(PurePosixPath(path).name)
             write(file)
         except OSError as error:
-            self._sender.warn_once(f"file {path}", f"MLflow run {self.run_id}: {path} cannot be kept: {error}")
+            self._warn_once(path, f"MLflow run {self.run_id}: {path} cannot be kept: {error}")
             return False
         self._append({"file": str(file.relative_to(self._journal.folder)), "path": path})
         return True
@@ -99,8 +98,8 @@ class TrackedRun:
         small = picture.copy()
         small.thumbnail((256, 256))
         # By such names MLflow's UI knows a series of pictures: MlflowClient.log_image in mlflow/tracking/client.py.
-        series = safe_name(name).replace("/", "~")
-        stem = f"images/{series}+step+{step}+timestamp+{int(time.time() * 1000)}+{uuid4()}"
+        at = f"step+{step}+timestamp+{int(time.time() * 1000)}+{uuid4()}"
+        stem = f"images/{safe_name(name).replace('/', '~')}+{at}"
         self.save(f"{stem}.png", partial(picture.save, compress_level=1))
         self.save(f"{stem}+compressed.webp", partial(small.save, quality=80))
         self.tags({IMAGES_TAG: "True"})
@@ -112,10 +111,8 @@ class TrackedRun:
     def close(self, status: Status | None, *, at_ms: int | None = None, timeout_s: float = _CLOSING_S) -> bool:
         """Send the rest and end the run; whether MLflow has everything. What it does not have stays on disk.
 
-        Args:
-            status: of the run; None leaves it as it is, and a run that is not ours keeps its own.
-            at_ms: when it ended, milliseconds since 1970; now when omitted.
-            timeout_s: to wait for a store at most without any progress.
+        Without a status, or of a run that is not ours, it keeps its own. `at_ms`, since 1970, is when it ended (now
+        when omitted), `timeout_s` how long to wait for a store without any progress.
         """
         journal = self._journal
         try:
@@ -127,26 +124,25 @@ class TrackedRun:
         finally:
             # A thread that hangs in a call keeps the journal until this process ends.
             stopped = self._sender.stop()
-            if stopped and not journal.pending and not journal.has_rejected:
+            if journal.pending:
+                reason = f"did not take all of run {self.run_id} ({self._sender.problem or 'it was too slow'})"
+                where = f"stay in {journal.folder}; send them with: {DELIVER}"
+                _log.warning("MLflow at %s %s; its last points %s", shown(self.address), reason, where)
+            if stopped and journal.pending:
+                journal.release()
+            elif stopped:
                 journal.remove()
-            else:
-                self._say_what_stays()
-                if stopped:
-                    journal.release()
         return not journal.pending
 
-    def _say_what_stays(self) -> None:
-        where = f"stay in {self._journal.folder}; send them with: {DELIVER}"
-        if self._journal.pending:
-            reason = f"did not take all of run {self.run_id} ({self._sender.problem or 'it was too slow'})"
-            _log.warning("MLflow at %s %s; its last points %s", shown(self.address), reason, where)
-        else:
-            _log.warning("MLflow refused some of run %s; those points %s --again", self.run_id, where)
+    def _warn_once(self, key: str, text: str) -> None:
+        if key not in self._told:
+            self._told.add(key)
+            _log.warning(text)
 
     def _append(self, entry: dict[str, Any]) -> None:
         self._journal.append(entry)
         if (problem := self._journal.problem) is not None:
-            self._sender.warn_once("disk", f"MLflow's points wait in memory, the disk takes none now: {problem}")
+            self._warn_once("disk", f"MLflow's points wait in memory, the disk takes none now: {problem}")
 
 
 @dataclass(frozen=True)
@@ -154,9 +150,9 @@ class NewRun:
     """What a run is made from."""
 
     experiment: str | None = None
-    """Made when it does not exist; as `experiments.chosen_experiment` says when None."""
+    """Made when it does not exist; None: as `experiments.chosen_experiment` says."""
     name: str | None = None
-    """MLflow invents one when None, the same one after each training that was seeded alike."""
+    """None: MLflow invents one, the same one after each training that was seeded alike."""
     tags: Mapping[str, str] = field(default_factory=dict)
     """Beside those of MLflow's run context."""
     parent: str | None = None
@@ -166,26 +162,18 @@ class NewRun:
 def start_run(address: str, new: NewRun, *, offline: bool | None = None, **options: Any) -> TrackedRun:
     """Begin a run; with `offline` although the store does not answer (None: as `AVP_MLFLOW_OFFLINE` says).
 
-    Options are those of `Sender`, as for the other ways to open a run.
-
     Raises:
         TrackingError: the store cannot be reached, or refuses.
     """
-    client = open_store(address, offline=offline, option="offline=True")
+    client = open_store(address, offline=offline)
     from mlflow.tracking.context.registry import resolve_tags
 
     experiment, experiment_id = chosen_experiment(new.experiment)
-    header = _header(address) | {
-        "experiment": experiment,
-        "experiment_id": experiment_id,
-        "name": new.name,
-        "tags": resolve_tags() | dict(new.tags),
-        "parent": new.parent,
-    }
-    journal = Journal.create(header)
+    about = {"experiment": experiment, "experiment_id": experiment_id, "name": new.name, "parent": new.parent}
+    journal = Journal.create(_header(address) | about | {"tags": resolve_tags() | dict(new.tags)})
     if client is not None:
         try:
-            journal.update({"run_id": create_run(client, header)})
+            journal.update({"run_id": create_run(client, journal.header)})
         except Exception as error:
             journal.remove()
             if isinstance(error, AVPError):
@@ -200,11 +188,10 @@ def continue_run(address: str, run_id: str, *, offline: bool | None = None, **op
     Raises:
         TrackingError: the store cannot be reached, or has no such run, or another process is writing the run.
     """
-    client = open_store(address, offline=offline, option="offline=True")
+    client = open_store(address, offline=offline)
     folder = journal_of(run_id)
     if folder is not None:
-        journal = Journal.adopt(folder)
-        if journal is None:
+        if (journal := Journal.adopt(folder)) is None:
             raise TrackingError(f"MLflow run {run_id}: another program is writing it ({folder})")
         journal.update({"address": absolute(address), "continue": True, "ended": None})
     else:
@@ -236,23 +223,12 @@ def may_continue(address: str, run_id: str) -> bool:
 
 
 def join_run(address: str, run_id: str, **options: Any) -> TrackedRun:
-    """Fill a run that somebody else has opened and will end.
-
-    Raises:
-        TrackingError: the store cannot be reached or has no such run.
-    """
+    """Fill a run that somebody else has opened and will end; a `TrackingError` where there is none."""
     client = connect(address)
-    run_id = existing_run(client, run_id).info.run_id
-    return TrackedRun(Journal.create(_header(address) | {"run_id": run_id, "owned": False}), client, **options)
+    about = {"run_id": existing_run(client, run_id).info.run_id, "owned": False}
+    return TrackedRun(Journal.create(_header(address) | about), client, **options)
 
 
 def _header(address: str) -> dict[str, Any]:
-    return {
-        "version": VERSION,
-        "key": uuid4().hex,
-        "address": absolute(address),
-        "run_id": None,
-        "owned": True,
-        "ended": None,
-        "started_ms": int(time.time() * 1000),
-    }
+    about = {"version": VERSION, "key": uuid4().hex, "address": absolute(address)}
+    return about | {"run_id": None, "owned": True, "ended": None, "started_ms": int(time.time() * 1000)}

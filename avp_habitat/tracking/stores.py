@@ -6,16 +6,16 @@ import logging
 import os
 import re
 import shlex
-import shutil
 import socket
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from avp_habitat.errors import AVPError
+from avp_habitat.files import atomic_file
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -63,8 +63,7 @@ def about_run(run_id: str, address: str, *, delivered: bool = True) -> str:
 
 def absolute(address: str) -> str:
     """An address that means the same in every folder."""
-    file = file_of(address)
-    if file is not None:
+    if (file := file_of(address)) is not None:
         return _with_file(address, file)
     return address if urlsplit(address).scheme else str(Path(address).absolute())
 
@@ -91,10 +90,8 @@ def is_missing(address: str) -> bool:
     return file is not None and not file.exists()
 
 
-def open_store(address: str, *, offline: bool | None = None, option: str | None = None) -> "MlflowClient | None":
+def open_store(address: str, *, offline: bool | None = None) -> "MlflowClient | None":
     """A client of the store; None when it does not answer and `offline`, or else `AVP_MLFLOW_OFFLINE`, allows that.
-
-    `option` is how the caller's users say so beside that variable, for the error's text.
 
     Raises:
         TrackingError: the store cannot be used.
@@ -104,8 +101,8 @@ def open_store(address: str, *, offline: bool | None = None, option: str | None 
     except StoreUnreachableError as error:
         if offline or (offline is None and os.environ.get(OFFLINE_VARIABLE, "") not in ("", "0")):
             return None
-        ways = ", or ".join(way for way in (option, f"{OFFLINE_VARIABLE}=1") if way)
-        raise StoreUnreachableError(f"{error}; to go on without it and send everything later: {ways}") from None
+        way = f"to go on without it and send everything later: {OFFLINE_VARIABLE}=1"
+        raise StoreUnreachableError(f"{error}; {way}") from None
 
 
 def connect(address: str, *, make: bool = True) -> "MlflowClient":
@@ -117,28 +114,22 @@ def connect(address: str, *, make: bool = True) -> "MlflowClient":
     """
     if (problem := unreachable(address)) is not None:
         raise StoreUnreachableError(_unusable(address, problem))
-    # A new database otherwise announces that it is made and each of its fifty migrations.
-    for name in ("alembic", "mlflow.store.db.utils"):
-        logging.getLogger(name).setLevel(logging.WARNING)
+    # A new database otherwise announces each of its fifty migrations, and a failure takes a hundred lines.
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)
     try:
         from mlflow import MlflowClient
     except ImportError as error:
         raise TrackingError(f"MLflow is asked for but not installed ({error}): pip install mlflow") from None
-    file = file_of(address)
-    if file is not None and (problem := _fault_of(file, make)) is not None:
-        elsewhere = "name another place, such as MLFLOW_TRACKING_URI=sqlite:////tmp/mlflow.db"
-        raise StoreUnreachableError(f"MLflow at {shown(address)} cannot be used: {problem}; {elsewhere}")
     try:
-        # Programs that start at once make one database, one after the other.
-        with nullcontext() if file is None else locked(hashlib.sha256(os.fsencode(file)).hexdigest()[:16]):
-            if file is not None and not file.exists():
-                _make_database(address, file)
-            client = MlflowClient(address)
-            client.search_experiments(max_results=1)
+        if (file := file_of(address)) is not None:
+            _prepare_file(address, file, make)
+        client = MlflowClient(address)
+        client.search_experiments(max_results=1)
     except Exception as error:
-        if (reason := _never_usable(address, file, first_line(error))) is not None:
-            raise TrackingError(_unusable(address, reason)) from None
-        raise StoreUnreachableError(_unusable(address, first_line(error))) from None
+        never = getattr(error, "error_code", None) == "INVALID_PARAMETER_VALUE"
+        kind = TrackingError if never else StoreUnreachableError
+        raise kind(_unusable(address, shown(first_line(error)))) from None
     return client
 
 
@@ -160,8 +151,6 @@ def unreachable(address: str) -> str | None:
 
 def first_line(error: BaseException) -> str:
     """An error's text without its tail of hints and stack frames."""
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.strerror}: {error.filename!r}"
     text = str(error).strip()
     # What a database says stands somewhere in SQLAlchemy's text: (sqlite3.OperationalError) database or disk is full
     of_database = re.search(r"^\((?:\w+\.)+\w+\) (.+)$", text, re.MULTILINE)
@@ -177,53 +166,23 @@ def locked(name: str) -> Iterator[None]:
         yield
 
 
-def _fault_of(path: Path, make: bool) -> str | None:
-    """Why MLflow could not use a file, existing or not; None when it can. MLflow itself tries for two minutes."""
-    if path.is_dir():
-        return "it is a folder"
-    if not (make or path.exists()):
-        return "the database is gone"
-    # A file that cannot be read is named below.
-    with suppress(OSError), path.open("rb") as file:
+def _prepare_file(address: str, path: Path, make: bool) -> None:
+    """Make a database, which appears when it has all tables; an `OSError` where MLflow would try for two minutes."""
+    # Programs that start at once make one database, one after the other.
+    with locked(hashlib.sha256(os.fsencode(path)).hexdigest()[:16]):
+        if make and not path.exists():
+            from mlflow.store.db import utils
+
+            with atomic_file(path, replace=False, failure=TrackingError) as partial:
+                partial.touch()  # SQLite would not say why it cannot.
+                engine = utils.create_sqlalchemy_engine(_with_file(address, partial))
+                try:
+                    utils._initialize_tables(engine)
+                finally:
+                    engine.dispose()
+    with path.open("r+b") as file:
         if file.read(len(_MAGIC)) not in (b"", _MAGIC):
-            return "it is no SQLite database"
-    folder = next(parent for parent in path.parents if parent.exists())
-    if not folder.is_dir():
-        return f"{folder} is no folder"
-    unwritable = [place for place in (path, folder) if place.exists() and not os.access(place, os.W_OK)]
-    return f"{unwritable[0]} cannot be written" if unwritable else None
-
-
-def _make_database(address: str, path: Path) -> None:
-    """Make a database, which appears when it has all tables: MLflow cannot go on with one that is half-made."""
-    from mlflow.store.db import utils
-
-    # One name for each machine that shares the folder, so that what a killed program left is found and made anew.
-    part = path.with_name(f".{path.name}.{socket.gethostname()}-{os.getuid()}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    engine = utils.create_sqlalchemy_engine(_with_file(address, part / path.name))
-    try:
-        utils._initialize_tables(engine)
-        engine.dispose()
-        if not path.exists():
-            (part / path.name).rename(path)
-    finally:
-        engine.dispose()
-        shutil.rmtree(part, ignore_errors=True)
-
-
-def _never_usable(address: str, file: Path | None, error: str) -> str | None:
-    """What is wrong with an address that cannot work another time either; None for an error that may pass."""
-    if file is not None and re.search("already exists|duplicate column", error):
-        what = "a program was killed while it made or renewed this database"
-        return f"{what}; put back a copy that you have, or move {file} away and start again"
-    if "MLFLOW_ALLOW_FILE_STORE" in error:
-        return "MLflow 3 keeps runs in a folder only when the variable MLFLOW_ALLOW_FILE_STORE=true is set"
-    if "unsupported URI" in error:
-        known = error.partition("[")[2].partition("]")[0]
-        return f"unknown scheme {urlsplit(address).scheme!r}; MLflow knows {known}"
-    return None
+            raise OSError(f"{path} is no SQLite database")
 
 
 def _unusable(address: str, problem: str) -> str:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 VERSION = "1"
-"""Value of the tag `avp.views`; with it, what people change or delete on the page stays as they left it."""
+"""Of the tag `avp.views`; with it, what people change or delete on the page stays as they left it."""
 MODEL_TRAINING = "workflowType=machine_learning"
 """Parameter of an address: MLflow 3.17 shows pages of traces first to a browser that has never been there."""
 _COLOURS = {
@@ -33,32 +33,22 @@ _LOG = logging.getLogger(__name__)
 
 Chart = dict[str, Any]
 """A chart as MLflow's page keeps it, with one colour per run."""
-
-
 _CHART: Chart = {"deleted": False, "isGenerated": False, "runsCountToCompare": 100}
 
 
 def _bar(metric: str) -> Chart:
-    """A bar per run."""
     return {"type": "BAR", "metricKey": metric}
 
 
 def _scatter(x: str, y: str) -> Chart:
-    """A point per run."""
     return {"type": "SCATTER", "xaxis": {"key": x, "type": "METRIC"}, "yaxis": {"key": y, "type": "METRIC"}}
 
 
 def _line(metric: str) -> Chart:
-    """The course of a metric by step."""
     x = {"xAxisKey": "step", "selectedXAxisMetricKey": "", "useGlobalXaxisKey": False, "xAxisScaleType": "linear"}
     y = {"yAxisKey": "metric", "yAxisExpressions": [], "scaleType": "linear", "range": {}, "lineSmoothness": 0}
     keys = {"metricKey": metric, "selectedMetricKeys": [metric], "useGlobalLineSmoothing": True}
     return {"type": "LINE", **keys, **x, **y}
-
-
-def _images(name: str) -> Chart:
-    """Pictures side by side."""
-    return {"type": "IMAGE", "imageKeys": [name], "step": 0}
 
 
 # What the page keeps beside, as MLflow 3.17 writes it.
@@ -74,22 +64,21 @@ _ALWAYS = json.loads("""{
 
 @dataclass(frozen=True)
 class RunsView:
-    """A view of the runs page.
-
-    `key` names it in addresses, `title` in the page's menu; `runs` is MLflow's filter of the runs that it shows.
-    `columns` of its table are metrics as `eval/psnr`, tags as `avp.policy` and parameters as `env.reward`; by `order`,
-    one of them, runs are sorted, the largest first. `charts` are groups by title, from top to bottom.
-    """
+    """A view of the runs page: its name in addresses, and its title in the page's menu."""
 
     key: str
     title: str
     runs: str
+    """MLflow's filter of the runs that it shows."""
     columns: str
+    """Metrics as `eval/psnr`, tags as `avp.policy`, parameters as `env.reward`."""
     order: str
+    """The column by which runs are sorted, the largest first."""
     charts: dict[str, list[Chart]]
+    """Groups by title, from top to bottom."""
 
     def tag(self, created_ms: int) -> str:
-        """Value of the experiment's tag that holds it, as MLflow's page keeps it."""
+        """Value of the experiment's tag that holds it."""
         columns = list(map(_column, self.columns.split()))
         shown = {"display": True, "isReordered": True, "deleted": False, "isGenerated": False}
         ids = {name: f"{self.key}-{number}" for number, name in enumerate(self.charts)}
@@ -98,8 +87,7 @@ class RunsView:
             "orderByKey": _column(self.order),
             "selectedColumns": columns,
             "columnOrder": columns,
-            # Pixels that hold a column's name.
-            "columnWidths": {_column(name): max(120, 40 + 7 * len(name)) for name in self.columns.split()},
+            "columnWidths": {_column(name): max(120, 40 + 7 * len(name)) for name in self.columns.split()},  # pixels
             "compareRunSections": [{"uuid": ids[name], "name": name, **shown} for name in self.charts],
             "compareRunCharts": [
                 {"uuid": f"{ids[name]}-{number}", "metricSectionId": ids[name], **_CHART, **chart}
@@ -138,7 +126,7 @@ EVALUATIONS = RunsView(
     columns="avp.policy eval/coverage eval/coverage_ci95 eval/views eval/cpv eval/stopped eval/episodes avp.scene",
     order="eval/coverage",
     charts={
-        "Coverage by view": [_line("eval/curve"), _images("eval/trajectory")],
+        "Coverage by view": [_line("eval/curve"), {"type": "IMAGE", "imageKeys": ["eval/trajectory"], "step": 0}],
         "A bar per policy": [_bar("eval/coverage"), _bar("eval/views"), _bar("eval/cpv")],
     },
 )
@@ -169,34 +157,31 @@ def run_colour(policy: str) -> str:
     return _COLOURS.get(policy, _MODEL_COLOURS[place])
 
 
-def prepare_experiment(client: "MlflowClient", experiment_id: str) -> str:
-    """Give an experiment its description and its views, once; later changes by people stay.
-
-    A store that refuses is a logged warning, because a training does not need its page.
-
-    Returns:
-        What follows the server's address, to open the reconstructions.
-    """
+def prepare_experiment(client: "MlflowClient", experiment_id: str) -> None:
+    """Give an experiment its description and its views, once; later changes by people stay. Failing is a warning."""
+    now = int(1000 * time.time())
     try:
         present = client.get_experiment(experiment_id).tags
-        if present.get(VIEWS_TAG) != VERSION:
-            for key, value in _tags(experiment_id, present).items():
-                client.set_experiment_tag(experiment_id, key, value)
+        if present.get(VIEWS_TAG) == VERSION:
+            return
+        once = {NOTE_TAG: _note(experiment_id), PAGE_TAG: "custom_model_development"}
+        tags = {key: value for key, value in once.items() if not present.get(key)}
+        # The menu shows the latest first.
+        tags |= {VIEW_TAG + view.key: view.tag(now - age) for age, view in enumerate(VIEWS)}
+        # The version comes last, so that a cut connection is made good by the next run.
+        for key, value in (*tags.items(), (VIEWS_TAG, VERSION)):
+            client.set_experiment_tag(experiment_id, key, value)
     except Exception as error:
         _LOG.warning("MLflow experiment %s: its page could not be prepared: %s", experiment_id, error)
-    return path_of(experiment_id)
-
-
-def _tags(experiment_id: str, present: dict[str, str]) -> dict[str, str]:
-    """All tags that are wanted; the version comes last, so that a cut connection is made good by the next run."""
-    now = int(1000 * time.time())
-    # The menu shows the latest first.
-    views = {VIEW_TAG + view.key: view.tag(now - age) for age, view in enumerate(VIEWS)}
-    once = {NOTE_TAG: _note(experiment_id), PAGE_TAG: "custom_model_development"}
-    return views | {key: value for key, value in once.items() if not present.get(key)} | {VIEWS_TAG: VERSION}
 
 
 _EXPLAINED = ("views", "coverage", "cpv", "ei", "annd_m", "redundant_views", "visibility", "psnr", "ssim", "lpips")
+
+
+def _explained(figure: Figure) -> str:
+    unit = f" [{figure.unit}]" if figure.unit and figure.scale == 1 else ""
+    better = f"; {figure.better} is better" if figure.better else ""
+    return f"- `eval/{figure.name}`{unit}: {figure.meaning}{better}"
 
 
 def _note(experiment_id: str) -> str:
@@ -213,9 +198,3 @@ More views: [evaluations, coverage by view]({path_of(experiment_id, EVALUATIONS,
 
 A table of the means by policy: `python -m avp_habitat.tracking.compare`, then the run *comparison*.
 """
-
-
-def _explained(figure: Figure) -> str:
-    unit = f" [{figure.unit}]" if figure.unit and figure.scale == 1 else ""
-    better = f"; {figure.better} is better" if figure.better else ""
-    return f"- `eval/{figure.name}`{unit}: {figure.meaning}{better}"
