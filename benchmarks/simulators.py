@@ -34,7 +34,7 @@ from avp_habitat.poses import Intrinsics
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.simulators.habitat import HabitatSimulator
-from avp_habitat.simulators.habitat.graphics import FIRST_DEVICE, choose_gpu, inspect_graphics
+from avp_habitat.simulators.habitat.graphics import choose_gpu, inspect_graphics
 from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.observations import NAMES
@@ -270,7 +270,7 @@ def _about(simulator: Simulator, gpu: int | None) -> dict[str, Any]:
     renderer = "Embree, on the CPU"
     if simulator.name == "habitat":
         device = choose_gpu(gpu)
-        context = inspect_graphics(FIRST_DEVICE).context if device < 0 else None
+        context = inspect_graphics(inspect_graphics().index_of(device)).context if device < 0 else None
         renderer = f"OpenGL {context.version}, {context.renderer}" if context else f"CUDA device {device}"
     return {"simulator": simulator.name, "version": simulator.version, "renderer": renderer}
 

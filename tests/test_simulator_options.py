@@ -49,7 +49,7 @@ def test_a_missing_navmesh_is_one_line(tmp_path, monkeypatch, capsys):
     line = ["--scene", "builtin:0", "--policy", "random", "--out", "r", "--navmesh", "rom.navmesh"]
     assert command.run(collect, line) == 1
     told = capsys.readouterr().err
-    assert told == "error: rom.navmesh: no such NavMesh file (.navmesh); did you mean room.navmesh?\n"
+    assert told == "error: rom.navmesh: no such NavMesh file (.navmesh); did you mean 'room.navmesh'?\n"
     assert [path.name for path in tmp_path.iterdir()] == ["room.navmesh"]
 
 

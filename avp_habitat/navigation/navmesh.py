@@ -1,6 +1,5 @@
 """The navigable area from a navigation mesh: which of its islands, and on which floor."""
 
-import difflib
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.errors import SceneError
+from avp_habitat.errors import SceneError, did_you_mean
 from avp_habitat.navigation.area import Float, NavigableArea, SurfaceBelow
 from avp_habitat.navigation.build import area_in_outline
 from avp_habitat.navigation.settings import NavigationSettings
@@ -57,10 +56,8 @@ def read_navmesh(path: Path) -> NavMesh:
         SceneError: it cannot be read, or is not what Habitat-Sim or Recast writes.
     """
     if not path.is_file():
-        names = sorted(entry.name for entry in path.parent.glob("*.navmesh") if entry.is_file())
-        near = difflib.get_close_matches(path.name, names, n=1, cutoff=0.5)
-        hint = f"; did you mean {near[0]}?" if near else ""
-        raise SceneError(f"{path}: no such NavMesh file (.navmesh){hint}")
+        names = (entry.name for entry in path.parent.glob("*.navmesh") if entry.is_file())
+        raise SceneError(f"{path}: no such NavMesh file (.navmesh){did_you_mean(path.name, names)}")
     try:
         content = _Content(path.read_bytes())
         agent = _agent(content)
