@@ -15,13 +15,14 @@ from avp_habitat.sight.bits import pack, unpack
 from avp_habitat.sight.lattice import Lattice, TileFiles, cache_folder
 from avp_habitat.sight.newly_seen import new_cells, new_surface
 from avp_habitat.sight.rules import camera_numbers, candidates, view_quality
-from avp_habitat.sight.tables import make_scene_tables, scene_tables
+from avp_habitat.sight.tables import scene_tables
 from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.task.cast import CastSensor
 from avp_habitat.task.settings import TaskSettings
 from avp_habitat.task.task import ViewpointTask
 from avp_habitat.task.views import Views, depth_statistics
 
+make_scene_tables = scene_tables.__wrapped__  # shared with nobody
 SETTINGS = TaskSettings(reward="coverage", lookup=True)
 CAMERA = SETTINGS.intrinsics
 

@@ -7,10 +7,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from avp_habitat.errors import UsageError
-from avp_habitat.policies.oracle.places import make_places, scene_places, views_from
+from avp_habitat.policies.oracle.places import scene_places, views_from
 from avp_habitat.policies.oracle.policy import OraclePolicy, make_plan, planned_coverage
-from avp_habitat.policies.oracle.search import BeamSettings, beam_search, start_state
-from avp_habitat.policies.oracle.tour import all_poses, covering_tour, greedy_cover
+from avp_habitat.policies.oracle.search import (
+    BeamSettings,
+    all_poses,
+    beam_search,
+    covering_tour,
+    greedy_cover,
+    start_state,
+)
 from avp_habitat.policies.reactive import RandomPolicy
 from avp_habitat.sight.bits import pack, unpack
 from avp_habitat.sight.rules import candidates
@@ -46,7 +52,7 @@ def play(env, policy, *, seed):
 
 
 def start_of(view):
-    return start_state(view.position, pack(view.observed[None])[0], yaw=view.yaw, pitch=view.pitch)
+    return start_state(view, len(view.observed))
 
 
 @pytest.mark.parametrize("scene", ["corridor", "room"])
@@ -120,7 +126,7 @@ def test_visible_sets_of_the_places_follow_the_rule_of_the_task(corridor):
 
 def test_a_range_limits_what_the_places_see(corridor):
     task = TaskSettings(max_range_m=2.5)
-    places = make_places(corridor, task)
+    places = scene_places(corridor, task)
     far = np.linalg.norm((places.points[None] - places.position[:, None])[..., [0, 2]], axis=-1) > 2.0001
     sees = unpack(places.sees, len(places.points))
     assert not (sees & far).any()
@@ -139,7 +145,7 @@ def test_reach_counts_the_steps_around_the_wall(corridor):
 
 def test_few_table_entries_give_a_coarser_grid_of_places_in_the_same_scene(corridor):
     task = TaskSettings()
-    fine, coarse = make_places(corridor, task), make_places(corridor, task, entries=200_000)
+    fine, coarse = scene_places(corridor, task), scene_places(corridor, task, entries=200_000)
     assert len(coarse.position) * len(coarse.points) <= 200_000 < len(fine.position) * len(fine.points)
     assert set(map(tuple, coarse.position)) <= set(map(tuple, fine.position))
     assert unpack(coarse.wanted[None], len(coarse.points)).all()
