@@ -238,7 +238,7 @@ def test_what_the_places_differ_on_is_returned_and_what_all_see_is_entered(room)
     views, centres = views_at(room.area, count, seed=5), room.area.centres
     pose, normals = views.camera_to_world, np.tile([0.0, 1.0, 0.0], (len(centres), 1))
     inside = candidates(pose, camera, centres, np.ones((count, len(centres)), bool), max_range_m=4.0)
-    assert len(inside) > 600  # more than there is room for at first
+    assert len(inside) > len(centres)  # more than there is room for at first
     quality = view_quality(pose[:, :3, 3], centres, normals)[tuple(inside.T)].astype(np.float32)
     members = np.zeros((2, len(centres)), bool)
     members[1] = True

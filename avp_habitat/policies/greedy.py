@@ -230,7 +230,7 @@ def expected_cells(known: KnownMap, misses: NDArray[np.uint8]) -> NDArray[np.boo
     free = (known.state == FREE) & (misses < TRIES)
     unknown = (known.state == UNKNOWN) & (misses < UNKNOWN_TRIES)
     beyond = round(BEYOND_M / known.cell_m)
-    return binary_dilation(free, mask=free | unknown, iterations=beyond)
+    return np.asarray(binary_dilation(free, mask=free | unknown, iterations=beyond), dtype=np.bool_)
 
 
 class GreedyPlanner(FrontierPlanner):
@@ -250,7 +250,8 @@ class GreedyPlanner(FrontierPlanner):
     def _best_moves(self, view: AgentView, known: KnownMap, misses: NDArray[np.uint8]) -> list[int]:
         settings = view.settings
         turn, forward = np.radians(settings.turn_deg), settings.forward_m / known.cell_m
-        start = Start(*known.at(view.position), view.yaw, view.pitch, turn, forward)
+        row, column = known.at(view.position)
+        start = Start(row, column, view.yaw, view.pitch, turn, forward)
         cells, lens = np.argwhere(expected_cells(known, misses)), make_lens(settings, known.cell_m)
         horizon = min(HORIZON, settings.budget - view.steps)
         moves, _ = search(known.state, cells, start, lens, horizon=horizon, discount=DISCOUNT)

@@ -147,13 +147,13 @@ def point_table(
     # A place is less than a lattice diagonal away from its points, so that points a little out of range count too.
     reach_m, tolerance_m = settings.max_range_m + 2 * SPACING_M, settings.tolerance_m
     samples = panorama.view_samples(settings.intrinsics, pitches(settings))
-    empty = {"visible": np.zeros((0, words_for(len(points))), dtype=np.uint64)}
+    empty: dict[str, NDArray] = {"visible": np.zeros((0, words_for(len(points))), dtype=np.uint64)}
     if statistics:
         empty["statistics"] = np.zeros((0, panorama.YAWS, len(samples.azimuth), 2), dtype=np.uint16)
 
     def compute(feet: Float) -> Columns:
         eye = feet + [0.0, settings.sensor_height_m, 0.0]
-        rows = {"visible": seen_bits(rays, eye, points, reach_m=reach_m, tolerance_m=tolerance_m)}
+        rows: dict[str, NDArray] = {"visible": seen_bits(rays, eye, points, reach_m=reach_m, tolerance_m=tolerance_m)}
         if statistics:
             around = panorama.look_around(rays, eye)
             rows["statistics"] = panorama.view_statistics(around, samples, settings.max_range_m)
