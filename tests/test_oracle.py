@@ -10,7 +10,6 @@ from avp_habitat.errors import UsageError
 from avp_habitat.policies.oracle.places import scene_places, views_from
 from avp_habitat.policies.oracle.policy import OraclePolicy, make_plan, planned_coverage
 from avp_habitat.policies.oracle.search import (
-    BeamSettings,
     all_poses,
     beam_search,
     covering_tour,
@@ -26,7 +25,7 @@ from avp_habitat.task.motion import act, sensor_poses
 from avp_habitat.task.settings import STOP, TaskSettings
 
 SMALL = {"width": 32, "height": 24, "reward": "coverage"}
-NARROW = BeamSettings(width=50)
+NARROW = 50
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +57,7 @@ def start_of(view):
 @pytest.mark.parametrize("scene", ["corridor", "room"])
 def test_planned_coverage_is_what_the_environment_measures(scene, request):
     env = AVPEnv(simulator=request.getfixturevalue(scene), **SMALL)
-    policy = OraclePolicy(lambda: agent_views(env), beam=NARROW)
+    policy = OraclePolicy(lambda: agent_views(env), width=NARROW)
     measured, actions = play(env, policy, seed=5)
     np.testing.assert_allclose(measured, policy.planner(0).plan.coverage, atol=0.01)
     assert STOP not in actions
@@ -100,7 +99,7 @@ def test_beam_search_finds_the_best_of_all_short_sequences(corridor):
     env = AVPEnv(simulator=corridor, **SMALL, budget=4, turn_deg=40.0, tilt_deg=20.0, forward_m=0.6)
     env.reset(seed=0)
     view, places = env.agent_view, scene_places(corridor, env.settings)
-    found = beam_search(places, env.settings, start_of(view), 4, BeamSettings())
+    found = beam_search(places, env.settings, start_of(view), 4, 1000)
     every = [np.array(actions) for actions in itertools.product(range(5), repeat=4)]
     values = [planned_coverage(view, actions).mean() for actions in every]
     assert planned_coverage(view, found).mean() >= max(values) - 0.005
@@ -183,7 +182,7 @@ def test_an_episode_taken_over_in_the_middle_is_planned_from_there(corridor):
     observation, _ = env.reset(seed=4)
     for action in (0, 1, 1):
         observation, *_ = env.step(action)
-    policy = OraclePolicy(lambda: agent_views(env), beam=NARROW)
+    policy = OraclePolicy(lambda: agent_views(env), width=NARROW)
     measured = []
     for _ in range(27):
         observation, _, _, _, info = env.step(int(policy.predict(observation)[0]))

@@ -151,7 +151,7 @@ def outlook(place, yaw, unseen, reach, heading, near_turn, far_turn, left, pace)
     Candidate i, after whose view `left` are left, stands at place `place[i]`, looks to `yaw[i]` (uint8, 256ths of a
     turn), and lacks the cells in row i of `unseen` `(n, words)`. `reach` and `heading` are those of `reach_tables`;
     `near_turn` and `far_turn` `(256,)` are the steps of turning until a cell at that difference of heading is in the
-    image, and until the agent faces it; `pace` is that of `BeamSettings`.
+    image, and until the agent faces it; `pace` is `search.PACE`.
     """
     result = np.zeros(len(place), np.float64)
     for i in range(len(place)):

@@ -24,6 +24,12 @@ HEADINGS = 12
 PITCHES_DEG = (0.0, -20.0, -40.0)
 """Of a tour's poses, degrees; those within the task's limit are used."""
 
+PER_KEY = 2
+"""Of a beam search: states kept of those that stand and look alike."""
+PACE = 2.0
+"""Of a beam search: steps counted for each step of the shortest way to a cell not yet seen; above 1, because one walk
+cannot take the shortest way to all cells at once."""
+
 _MOVES = np.array([MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, LOOK_UP, LOOK_DOWN])
 _AHEAD_M = 0.8
 _ARRIVED_M = 0.2
@@ -52,30 +58,18 @@ def start_state(view: AgentView, members: int) -> States:
     return States(view.position[None], np.array([view.yaw]), np.array([view.pitch]), pack(seen), np.zeros(1))
 
 
-@dataclass(frozen=True)
-class BeamSettings:
-    """How widely to search, and what to hope for."""
-
-    width: int = 1000
-    """States kept after each step."""
-    per_key: int = 2
-    """States kept of those that stand and look alike."""
-    pace: float = 2.0
-    """Steps counted for each step of the shortest way to a cell not yet seen; above 1, because one walk cannot take
-    the shortest way to all cells at once."""
-
-
 def beam_search(
-    places: ScenePlaces, settings: TaskSettings, start: States, views: int, beam: BeamSettings
+    places: ScenePlaces, settings: TaskSettings, start: States, views: int, width: int
 ) -> NDArray[np.int64]:
     """The `(views,)` actions that make the area under the curve of coverage over views as large as the beam finds.
 
-    They never stop. States are ranked by the area that is certain, plus, for every cell not yet seen, the views that
-    would be left if the agent turned and walked straight to where that cell is in sight.
+    They never stop. The best `width` states are kept after each step, ranked by the area that is certain, plus, for
+    every cell not yet seen, the views that would be left if the agent turned and walked straight to where that cell is
+    in sight.
     """
     states, history = start, []
     for left in range(views - 1, -1, -1):
-        states, parent, action = _advance(places, settings, states, left, beam)
+        states, parent, action = _advance(places, settings, states, left, width)
         history.append((parent, action))
     row = int(np.argmax(states.value))
     actions = []
@@ -86,7 +80,7 @@ def beam_search(
 
 
 def _advance(
-    places: ScenePlaces, settings: TaskSettings, states: States, left: int, beam: BeamSettings
+    places: ScenePlaces, settings: TaskSettings, states: States, left: int, width: int
 ) -> tuple[States, NDArray[np.int64], NDArray[np.int64]]:
     """The states after one more view, the rows that they come from, and the actions that lead to them."""
     n = len(states.value)
@@ -102,13 +96,13 @@ def _advance(
     heading = (np.round(yaw / (2 * np.pi) * 256).astype(np.int64) & 255).astype(np.uint8)
     seen = states.seen[parent] | fresh
     hope = kernels.outlook(
-        place, heading, places.wanted & ~seen, places.reach, places.heading, *_turning(settings), left, beam.pace
+        place, heading, places.wanted & ~seen, places.reach, places.heading, *_turning(settings), left, PACE
     )
     turn = np.round(wrap_angle(yaw) / np.radians(settings.turn_deg)).astype(np.int64)
     tilt = np.round(pitch / np.radians(settings.tilt_deg)).astype(np.int64)
     key = 1 + (place * 4096 + turn + 2048) * 4096 + tilt + 2048
     order = np.argsort(-(value + hope), kind="stable")
-    kept = kernels.choose(order, key, seen, beam.width, beam.per_key)
+    kept = kernels.choose(order, key, seen, width, PER_KEY)
     return States(position[kept], yaw[kept], pitch[kept], seen[kept], value[kept]), parent[kept], action[kept]
 
 
