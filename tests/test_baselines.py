@@ -5,20 +5,27 @@ import numpy as np
 import pytest
 from corridor import Corridor
 
-from avp_habitat.policies.frontier import Approach, FrontierPlanner, FrontierPolicy, find_frontiers
+from avp_habitat.policies.frontier import (
+    FrontierPlanner,
+    FrontierPolicy,
+    find_frontiers,
+    route_to,
+    shortest_walks,
+    walkable,
+)
 from avp_habitat.policies.greedy import GreedyPlanner, Start, expected_cells, search
-from avp_habitat.policies.known_map import (
+from avp_habitat.policies.predicted_views import (
     BLOCKED,
     FREE,
     OBSERVED,
     UNKNOWN,
     KnownMap,
+    Memory,
+    in_view,
     known_map,
-    route_to,
-    shortest_walks,
-    walkable,
+    looking_down,
+    make_lens,
 )
-from avp_habitat.policies.predicted_views import Memory, in_view, looking_down, make_lens
 from avp_habitat.policies.reactive import SpinPlanner
 from avp_habitat.policies.registry import make_policy
 from avp_habitat.poses import camera_to_world, project
@@ -262,8 +269,6 @@ def test_without_a_frontier_the_planners_turn_in_place():
     for planner in (FrontierPlanner(), GreedyPlanner()):
         view = view_at(corridor, 1.0, 1.0, pitch=looking_down(SETTINGS), observed=everything)
         assert [planner.act(replace(view, steps=step)) for step in (1, 2, 3)] == [TURN_LEFT] * 3
-    known = known_map(view, view.position[None])
-    assert Approach().next_action(view, known, []) is None
 
 
 @pytest.mark.parametrize(("x", "action"), [(1.0, TURN_RIGHT), (5.0, TURN_LEFT)])

@@ -15,13 +15,14 @@ from avp_habitat.sight.bits import pack, unpack
 from avp_habitat.sight.lattice import Lattice, TileFiles, cache_folder
 from avp_habitat.sight.newly_seen import new_cells, new_surface
 from avp_habitat.sight.rules import camera_numbers, candidates, view_quality
-from avp_habitat.sight.tables import make_scene_tables, scene_tables
+from avp_habitat.sight.tables import scene_tables
 from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.task.cast import CastSensor
 from avp_habitat.task.settings import TaskSettings
 from avp_habitat.task.task import ViewpointTask
 from avp_habitat.task.views import Views, depth_statistics
 
+make_scene_tables = scene_tables.__wrapped__  # shared with nobody
 SETTINGS = TaskSettings(reward="coverage", lookup=True)
 CAMERA = SETTINGS.intrinsics
 
@@ -237,7 +238,7 @@ def test_what_the_places_differ_on_is_returned_and_what_all_see_is_entered(room)
     views, centres = views_at(room.area, count, seed=5), room.area.centres
     pose, normals = views.camera_to_world, np.tile([0.0, 1.0, 0.0], (len(centres), 1))
     inside = candidates(pose, camera, centres, np.ones((count, len(centres)), bool), max_range_m=4.0)
-    assert len(inside) > 600  # more than there is room for at first
+    assert len(inside) > len(centres)  # more than there is room for at first
     quality = view_quality(pose[:, :3, 3], centres, normals)[tuple(inside.T)].astype(np.float32)
     members = np.zeros((2, len(centres)), bool)
     members[1] = True

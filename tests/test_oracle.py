@@ -7,10 +7,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from avp_habitat.errors import UsageError
-from avp_habitat.policies.oracle.places import make_places, scene_places, views_from
+from avp_habitat.policies.oracle.places import scene_places, views_from
 from avp_habitat.policies.oracle.policy import OraclePolicy, make_plan, planned_coverage
-from avp_habitat.policies.oracle.search import BeamSettings, beam_search, start_state
-from avp_habitat.policies.oracle.tour import all_poses, covering_tour, greedy_cover
+from avp_habitat.policies.oracle.search import (
+    all_poses,
+    beam_search,
+    covering_tour,
+    greedy_cover,
+    start_state,
+)
 from avp_habitat.policies.reactive import RandomPolicy
 from avp_habitat.sight.bits import pack, unpack
 from avp_habitat.sight.rules import candidates
@@ -20,7 +25,7 @@ from avp_habitat.task.motion import act, sensor_poses
 from avp_habitat.task.settings import STOP, TaskSettings
 
 SMALL = {"width": 32, "height": 24, "reward": "coverage"}
-NARROW = BeamSettings(width=50)
+NARROW = 50
 
 
 @pytest.fixture(scope="module")
@@ -46,13 +51,13 @@ def play(env, policy, *, seed):
 
 
 def start_of(view):
-    return start_state(view.position, pack(view.observed[None])[0], yaw=view.yaw, pitch=view.pitch)
+    return start_state(view, len(view.observed))
 
 
 @pytest.mark.parametrize("scene", ["corridor", "room"])
 def test_planned_coverage_is_what_the_environment_measures(scene, request):
     env = AVPEnv(simulator=request.getfixturevalue(scene), **SMALL)
-    policy = OraclePolicy(lambda: agent_views(env), beam=NARROW)
+    policy = OraclePolicy(lambda: agent_views(env), width=NARROW)
     measured, actions = play(env, policy, seed=5)
     np.testing.assert_allclose(measured, policy.planner(0).plan.coverage, atol=0.01)
     assert STOP not in actions
@@ -94,7 +99,7 @@ def test_beam_search_finds_the_best_of_all_short_sequences(corridor):
     env = AVPEnv(simulator=corridor, **SMALL, budget=4, turn_deg=40.0, tilt_deg=20.0, forward_m=0.6)
     env.reset(seed=0)
     view, places = env.agent_view, scene_places(corridor, env.settings)
-    found = beam_search(places, env.settings, start_of(view), 4, BeamSettings())
+    found = beam_search(places, env.settings, start_of(view), 4, 1000)
     every = [np.array(actions) for actions in itertools.product(range(5), repeat=4)]
     values = [planned_coverage(view, actions).mean() for actions in every]
     assert planned_coverage(view, found).mean() >= max(values) - 0.005
@@ -120,7 +125,7 @@ def test_visible_sets_of_the_places_follow_the_rule_of_the_task(corridor):
 
 def test_a_range_limits_what_the_places_see(corridor):
     task = TaskSettings(max_range_m=2.5)
-    places = make_places(corridor, task)
+    places = scene_places(corridor, task)
     far = np.linalg.norm((places.points[None] - places.position[:, None])[..., [0, 2]], axis=-1) > 2.0001
     sees = unpack(places.sees, len(places.points))
     assert not (sees & far).any()
@@ -139,7 +144,7 @@ def test_reach_counts_the_steps_around_the_wall(corridor):
 
 def test_few_table_entries_give_a_coarser_grid_of_places_in_the_same_scene(corridor):
     task = TaskSettings()
-    fine, coarse = make_places(corridor, task), make_places(corridor, task, entries=200_000)
+    fine, coarse = scene_places(corridor, task), scene_places(corridor, task, entries=200_000)
     assert len(coarse.position) * len(coarse.points) <= 200_000 < len(fine.position) * len(fine.points)
     assert set(map(tuple, coarse.position)) <= set(map(tuple, fine.position))
     assert unpack(coarse.wanted[None], len(coarse.points)).all()
@@ -177,7 +182,7 @@ def test_an_episode_taken_over_in_the_middle_is_planned_from_there(corridor):
     observation, _ = env.reset(seed=4)
     for action in (0, 1, 1):
         observation, *_ = env.step(action)
-    policy = OraclePolicy(lambda: agent_views(env), beam=NARROW)
+    policy = OraclePolicy(lambda: agent_views(env), width=NARROW)
     measured = []
     for _ in range(27):
         observation, _, _, _, info = env.step(int(policy.predict(observation)[0]))

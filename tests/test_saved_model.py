@@ -130,16 +130,6 @@ def test_statistics_of_other_observations_are_refused(trained, tmp_path):
         make_policy(str(path), SmallEnv(), 0)
 
 
-def test_statistics_of_a_shorter_training_are_named(trained, tmp_path, caplog):
-    path = put(trained, tmp_path, "a.zip", "vec_normalize.pkl")
-    make_policy(str(path), SmallEnv(), 0)
-    assert not caplog.messages
-    normalised_ppo().learn(128).save(path)
-    make_policy(str(path), SmallEnv(), 0)
-    [message] = caplog.messages
-    assert "vec_normalize.pkl: computed from 66 observations, but the model was trained for 128 steps" in message
-
-
 @pytest.mark.parametrize("content", [b"", b"no pickle", pickle.dumps([1, 2]), pickle.dumps(np.ones(3))[:-9]])
 def test_statistics_that_are_none_are_named(trained, tmp_path, content):
     path = put(trained, tmp_path, "m.zip", None)

@@ -8,7 +8,7 @@ from avp_habitat.sight.bits import unpack
 from avp_habitat.sight.rules import view_quality
 from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.surface.map import CELL_M, FULL, GROUPS, SIDE, SurfaceMapper
-from avp_habitat.surface.memory import make_surface_tables, raise_quality, surface_tables
+from avp_habitat.surface.memory import raise_quality, surface_tables
 from avp_habitat.surface.points import EDGE_M, SceneSurface, scene_surface
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.settings import TaskSettings
@@ -147,14 +147,14 @@ def test_tables_and_rays_agree_over_whole_episodes(room, other):
 def test_a_surface_table_holds_what_rays_from_its_place_reach(room, tmp_path, monkeypatch):
     monkeypatch.setenv("AVP_CACHE", str(tmp_path))
     settings = TaskSettings(reward="surface", lookup=True)
-    tables, points = make_surface_tables(room, settings), scene_surface(room, settings).points
+    tables, points = surface_tables.__wrapped__(room, settings), scene_surface(room, settings).points
     feet = room.area.centres[[100]]
     slots, _ = tables.around(feet)
     eye = tables.lattice.feet(tables.lattice.around(feet)[0][0]) + [0, 1.5, 0]
     pairs = np.argwhere(np.ones((4, len(points)), dtype=bool))
     reached = room.reached(eye, points, pairs, tolerance_m=0.1).reshape(4, -1)
     np.testing.assert_array_equal(unpack(tables.columns["visible"][slots[0]], len(points)), reached)
-    again = make_surface_tables(room, settings)
+    again = surface_tables.__wrapped__(room, settings)
     again._compute = None
     again.around(feet)
     np.testing.assert_array_equal(again.columns["visible"], tables.columns["visible"])

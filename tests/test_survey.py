@@ -4,14 +4,13 @@ import pytest
 from avp_habitat.errors import UsageError
 from avp_habitat.policies.oracle.places import SURFACE_SPACING_M, surface_points
 from avp_habitat.policies.oracle.policy import OraclePolicy, SurveyPolicy
-from avp_habitat.policies.oracle.search import BeamSettings
 from avp_habitat.policies.reactive import RandomPolicy
 from avp_habitat.sight.rules import candidates
 from avp_habitat.task.agent_view import agent_views
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.motion import sensor_poses
 
-NARROW = BeamSettings(width=50)
+NARROW = 50
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +36,8 @@ def share_of_surfaces_seen(env, policy):
 
 
 def test_the_survey_sees_more_surfaces_than_the_oracle_and_more_floor_than_chance(env):
-    survey, its_floor = share_of_surfaces_seen(env, SurveyPolicy(lambda: agent_views(env), beam=NARROW))
-    oracle, _ = share_of_surfaces_seen(env, OraclePolicy(lambda: agent_views(env), beam=NARROW))
+    survey, its_floor = share_of_surfaces_seen(env, SurveyPolicy(lambda: agent_views(env), width=NARROW))
+    oracle, _ = share_of_surfaces_seen(env, OraclePolicy(lambda: agent_views(env), width=NARROW))
     random, random_floor = share_of_surfaces_seen(env, RandomPolicy.for_env(env, seed=0))
     assert survey > max(oracle, random) + 0.1
     assert its_floor > random_floor + 0.1

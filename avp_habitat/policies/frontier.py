@@ -1,22 +1,23 @@
 """The baseline that goes to the nearest frontier of the observed floor (Yamauchi 1997)."""
 
+import heapq
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.policies.known_map import (
+from avp_habitat.compiled import njit
+from avp_habitat.policies.planning import PlanningPolicy
+from avp_habitat.policies.predicted_views import (
     FREE,
     OBSERVED,
     UNKNOWN,
     KnownMap,
-    farthest_straight,
-    route_to,
-    shortest_walks,
-    walkable,
+    Memory,
+    in_view,
+    make_lens,
+    should_look_down,
 )
-from avp_habitat.policies.planning import PlanningPolicy
-from avp_habitat.policies.predicted_views import Memory, in_view, make_lens, should_look_down
 from avp_habitat.poses import wrap_angle
 from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.settings import LOOK_DOWN, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT
@@ -64,38 +65,78 @@ def find_frontiers(known: KnownMap, misses: NDArray[np.uint8]) -> list[Frontier]
     return found
 
 
+def route_to(before: NDArray[np.int64], goal: NDArray[np.int64]) -> NDArray[np.int64]:
+    """`(k, 2)` cells from the start, which is left out, to a reachable goal `(2,)`."""
+    columns = before.shape[1]
+    at = int(goal[0]) * columns + int(goal[1])
+    cells = []
+    while before.flat[at] >= 0:
+        cells.append(divmod(at, columns))
+        at = int(before.flat[at])
+    return np.array(cells[::-1], dtype=np.int64).reshape(-1, 2)
+
+
+def farthest_straight(navigable: NDArray[np.bool_], at: Float, route: NDArray[np.int64]) -> Float:
+    """`(2,)` centre of the last cell of a route `(k, 2)`, k > 0, to which a straight walk stays in navigable cells."""
+    for cell in route[::-1]:
+        if walkable(navigable, at[0], at[1], cell[0] + 0.5, cell[1] + 0.5):
+            return cell + 0.5
+    return route[0] + 0.5
+
+
+@njit(cache=True)
+def walkable(cells, row, column, to_row, to_column):
+    """Whether a straight walk between two points of the grid stays in the true cells `(rows, columns)`.
+
+    The cell in which it begins is not asked; the walk is sampled twice per cell of the longer axis.
+    """
+    steps = int(np.ceil(2.0 * max(abs(to_row - row), abs(to_column - column))))
+    for i in range(1, steps + 1):
+        r, c = int(row + (to_row - row) * i / steps), int(column + (to_column - column) * i / steps)
+        if (r != int(row) or c != int(column)) and not cells[r, c]:
+            return False
+    return True
+
+
+@njit(cache=True)
+def shortest_walks(navigable, start_row, start_column):
+    """Dijkstra over 8-connected cells `(rows, columns)`, without cutting corners; the start need not be navigable.
+
+    Returns:
+        `(rows, columns)` lengths in cells, inf where unreachable, and the flat index of the cell before, -1 for none.
+    """
+    rows, columns = navigable.shape
+    length = np.full((rows, columns), np.inf)
+    before = np.full((rows, columns), -1, np.int64)
+    length[start_row, start_column] = 0.0
+    queue = [(0.0, start_row * columns + start_column)]
+    while queue:
+        so_far, at = heapq.heappop(queue)
+        row, column = at // columns, at % columns
+        if so_far > length[row, column]:
+            continue
+        for dr in range(-1, 2):
+            for dc in range(-1, 2):
+                r, c = row + dr, column + dc
+                if r < 0 or c < 0 or r >= rows or c >= columns or not navigable[r, c]:
+                    continue
+                if dr != 0 and dc != 0 and not (navigable[row, c] and navigable[r, column]):
+                    continue
+                total = so_far + np.sqrt(float(dr * dr + dc * dc))
+                if total < length[r, c] - 1e-9:
+                    length[r, c] = total
+                    before[r, c] = at
+                    heapq.heappush(queue, (total, r * columns + c))
+    return length, before
+
+
 @dataclass(frozen=True)
 class _Way:
     """How to bring one frontier into view."""
 
-    moves: float
-    """Estimated number of moves."""
-    action: int
-    """The first one."""
-    goal: NDArray[np.int64]
-    """`(2,)` the frontier's nearest cell, in the scene's grid."""
-
-
-class Approach:
-    """Follows the shortest walk over known floor to a frontier, or turns to it where that shows it."""
-
-    def __init__(self) -> None:
-        """Prefer no frontier yet."""
-        self._goal: NDArray[np.int64] | None = None
-
-    def next_action(self, view: AgentView, known: KnownMap, frontiers: list[Frontier]) -> int | None:
-        """The first move towards the frontier that takes the fewest moves; None when none can be reached."""
-        here = _Here(view, known)
-        ways = [way for frontier in frontiers if (way := here.way_to(frontier)) is not None]
-        if not ways:
-            self._goal = None
-            return None
-        way = min(ways, key=lambda way: way.moves - LOYALTY_MOVES * self._is_same(way, known.cell_m))
-        self._goal = way.goal
-        return way.action
-
-    def _is_same(self, way: _Way, cell_m: float) -> bool:
-        return self._goal is not None and float(np.hypot(*(way.goal - self._goal))) * cell_m < SAME_M
+    moves: float  # an estimate of their number
+    action: int  # the first one
+    goal: NDArray[np.int64]  # (2,) the frontier's nearest cell, in the scene's grid
 
 
 class _Here:
@@ -117,7 +158,9 @@ class _Here:
         if not np.isfinite(lengths.min()):
             return None
         goal = nearest + self._known.first
-        aim, moves = self._walk(frontier, nearest, float(lengths.min()))
+        route = route_to(self._before, nearest)
+        aim = farthest_straight(self._navigable, self._at, route) if len(route) else frontier.edge.mean(axis=0) + 0.5
+        moves = float(lengths.min()) / self._forward + abs(self._angle(aim)) / self._turn
         look = self._look(frontier.edge)
         if look is not None:
             beyond_view = max(abs(self._angle(look)) - self._half_view, 0.0)
@@ -126,12 +169,6 @@ class _Here:
                 return _Way(moves, self._turn_to(look), goal)
         action = self._turn_to(aim)
         return None if action == MOVE_FORWARD and self._leaves_known_floor() else _Way(moves, action, goal)
-
-    def _walk(self, frontier: Frontier, nearest: NDArray[np.int64], length: float) -> tuple[Float, float]:
-        """Point `(2,)` to walk to first, and the number of moves of the whole walk."""
-        route = route_to(self._before, nearest)
-        aim = farthest_straight(self._navigable, self._at, route) if len(route) else frontier.edge.mean(axis=0) + 0.5
-        return aim, length / self._forward + abs(self._angle(aim)) / self._turn
 
     def _look(self, edge: NDArray[np.int64]) -> Float | None:
         """Centre `(2,)` of the nearest cell that is out of view now and would be in view after turning to it."""
@@ -170,17 +207,28 @@ class FrontierPlanner:
     """
 
     def __init__(self) -> None:
-        """Know nothing."""
+        """Know nothing, prefer no frontier yet."""
         self._memory = Memory()
-        self._approach = Approach()
+        self._goal: NDArray[np.int64] | None = None
 
     def act(self, view: AgentView) -> int:
         """The next action."""
         known, misses = self._memory.update(view)
-        if should_look_down(view):
-            return LOOK_DOWN
-        action = self._approach.next_action(view, known, find_frontiers(known, misses))
-        return TURN_LEFT if action is None else action
+        return LOOK_DOWN if should_look_down(view) else self.explore(view, known, misses)
+
+    def explore(self, view: AgentView, known: KnownMap, misses: NDArray[np.uint8]) -> int:
+        """The first move towards the frontier that takes the fewest; `misses` as `Memory.update` gives it."""
+        here = _Here(view, known)
+        ways = [way for frontier in find_frontiers(known, misses) if (way := here.way_to(frontier)) is not None]
+        if not ways:
+            self._goal = None
+            return TURN_LEFT
+        way = min(ways, key=lambda way: way.moves - LOYALTY_MOVES * self._is_same(way, known.cell_m))
+        self._goal = way.goal
+        return way.action
+
+    def _is_same(self, way: _Way, cell_m: float) -> bool:
+        return self._goal is not None and float(np.hypot(*(way.goal - self._goal))) * cell_m < SAME_M
 
 
 class FrontierPolicy(PlanningPolicy):

@@ -6,13 +6,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.compiled import njit
-from avp_habitat.policies.frontier import TRIES, Approach, find_frontiers
-from avp_habitat.policies.known_map import FREE, OBSERVED, UNKNOWN, KnownMap, walkable
+from avp_habitat.policies.frontier import TRIES, FrontierPlanner, walkable
 from avp_habitat.policies.planning import PlanningPolicy
-from avp_habitat.policies.predicted_views import Lens, Memory, clear_line, in_frame, make_lens, should_look_down
+from avp_habitat.policies.predicted_views import (
+    FREE,
+    OBSERVED,
+    UNKNOWN,
+    KnownMap,
+    Lens,
+    clear_line,
+    in_frame,
+    make_lens,
+)
 from avp_habitat.sight.bits import ONE, size
 from avp_habitat.task.agent_view import AgentView
-from avp_habitat.task.settings import LOOK_DOWN, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT
+from avp_habitat.task.settings import MOVE_FORWARD, TURN_LEFT, TURN_RIGHT
 
 HORIZON = 12
 """Moves that the search looks ahead."""
@@ -34,17 +42,14 @@ class Start(NamedTuple):
     """Where a search begins; lengths in cells, angles in radians."""
 
     row: float
-    """Of the agent; a cell's centre lies at +0.5."""
     column: float
-    """Of the agent."""
+    """Of the agent; a cell's centre lies at +0.5."""
     yaw: float
-    """Left positive."""
     pitch: float
-    """Up positive; it stays as it is."""
+    """Left and up are positive; the pitch stays as it is."""
     turn: float
-    """Yaw of one turn."""
     forward: float
-    """Length of a forward move."""
+    """What one move makes."""
 
 
 class _Scene(NamedTuple):
@@ -59,51 +64,29 @@ class _Scene(NamedTuple):
 class _Tree(NamedTuple):
     """A node is a place and a heading: `place * (2 horizon + 1) + heading`; heading `horizon` is the start's own."""
 
-    places: NDArray[np.float64]
-    """`(places, 2)` rows and columns."""
-    place_at: NDArray[np.int64]
-    """`(rows, columns)` of merged squares: the place there, -1 for none."""
-    used: NDArray[np.int64]
-    """`(1,)` number of places."""
-    views: NDArray[np.uint64]
-    """`(places, headings, words)` bits of the cells that a view from there should observe."""
-    depth: NDArray[np.int64]
-    """`(nodes,)` fewest moves that lead there, -1 for none."""
-    gain: NDArray[np.float64]
-    """`(nodes,)` of the way there."""
-    before: NDArray[np.int64]
-    """`(nodes,)` on the way there."""
-    move: NDArray[np.int64]
-    """`(nodes,)` from the node before."""
-    seen: NDArray[np.uint64]
-    """`(nodes, words)` bits of the cells that the views on the way should observe."""
+    places: NDArray[np.float64]  # (places, 2) rows and columns
+    place_at: NDArray[np.int64]  # (rows, columns) of merged squares: the place there, -1 for none
+    used: NDArray[np.int64]  # (1,) number of places
+    views: NDArray[np.uint64]  # (places, headings, words) bits of the cells that a view from there should observe
+    depth: NDArray[np.int64]  # (nodes,) fewest moves that lead there, -1 for none
+    gain: NDArray[np.float64]  # (nodes,) of the way there
+    before: NDArray[np.int64]  # (nodes,) on the way there
+    move: NDArray[np.int64]  # (nodes,) from the node before
+    seen: NDArray[np.uint64]  # (nodes, words) bits of the cells that the views on the way should observe
 
 
 def search(
-    state: NDArray[np.uint8],
-    cells: NDArray[np.int64],
-    start: Start,
-    lens: Lens,
-    *,
-    horizon: int,
-    discount: float,
+    state: NDArray[np.uint8], cells: NDArray[np.int64], start: Start, lens: Lens, *, horizon: int, discount: float
 ) -> tuple[list[int], float]:
-    """The moves (forward and turns) whose views should newly observe most; none when nothing is gained.
+    """The moves (forward and turns) whose views should newly observe most of the `(k, 2)` cells that count.
 
     The search walks through known navigable cells only. Of the ways that lead to the same place and heading with the
     fewest moves it keeps the one that gains most, so that its effort grows with the reachable poses, not with the
     sequences of moves.
 
-    Args:
-        state: `(rows, columns)` of a `KnownMap`.
-        cells: `(k, 2)` rows and columns of the cells that count.
-        start: where the agent is.
-        lens: of the camera.
-        horizon: greatest number of moves.
-        discount: what a cell counts less for every move by which it is observed later.
-
     Returns:
-        The moves, and their gain: newly observed cells times `discount ** (moves before the view)`.
+        The moves, `horizon` at most and none when nothing is gained, and their gain: newly observed cells times
+        `discount ** (moves before the view)`.
     """
     if not len(cells) or horizon < 1:
         return [], 0.0
@@ -246,46 +229,32 @@ def expected_cells(known: KnownMap, misses: NDArray[np.uint8]) -> NDArray[np.boo
 
     free = (known.state == FREE) & (misses < TRIES)
     unknown = (known.state == UNKNOWN) & (misses < UNKNOWN_TRIES)
-    if not free.any():
-        return free
-    return np.asarray(
-        binary_dilation(free, mask=free | unknown, iterations=round(BEYOND_M / known.cell_m)), dtype=np.bool_
-    )
+    beyond = round(BEYOND_M / known.cell_m)
+    return np.asarray(binary_dilation(free, mask=free | unknown, iterations=beyond), dtype=np.bool_)
 
 
-class GreedyPlanner:
-    """Looks down at the floor, then makes the moves whose views should observe most."""
+class GreedyPlanner(FrontierPlanner):
+    """Looks down at the floor, then makes the moves whose views should observe most, or goes to a frontier."""
 
     def __init__(self) -> None:
         """Know nothing, plan nothing."""
-        self._memory = Memory()
-        self._approach = Approach()
+        super().__init__()
         self._moves: list[int] = []
 
-    def act(self, view: AgentView) -> int:
-        """The next action."""
-        known, misses = self._memory.update(view)
-        if should_look_down(view):
-            return LOOK_DOWN
+    def explore(self, view: AgentView, known: KnownMap, misses: NDArray[np.uint8]) -> int:
+        """The next of the best moves; where none gains anything, that towards a frontier."""
         if view.collided or not self._moves:
             self._moves = self._best_moves(view, known, misses)
-        if self._moves:
-            return self._moves.pop(0)
-        action = self._approach.next_action(view, known, find_frontiers(known, misses))
-        return TURN_LEFT if action is None else action
+        return self._moves.pop(0) if self._moves else super().explore(view, known, misses)
 
     def _best_moves(self, view: AgentView, known: KnownMap, misses: NDArray[np.uint8]) -> list[int]:
         settings = view.settings
-        row, column = known.at(view.position)
         turn, forward = np.radians(settings.turn_deg), settings.forward_m / known.cell_m
-        moves, _ = search(
-            known.state,
-            np.argwhere(expected_cells(known, misses)),
-            Start(row, column, view.yaw, view.pitch, turn, forward),
-            make_lens(settings, known.cell_m),
-            horizon=min(HORIZON, settings.budget - view.steps),
-            discount=DISCOUNT,
-        )
+        row, column = known.at(view.position)
+        start = Start(row, column, view.yaw, view.pitch, turn, forward)
+        cells, lens = np.argwhere(expected_cells(known, misses)), make_lens(settings, known.cell_m)
+        horizon = min(HORIZON, settings.budget - view.steps)
+        moves, _ = search(known.state, cells, start, lens, horizon=horizon, discount=DISCOUNT)
         return moves[:COMMITTED]
 
 

@@ -34,8 +34,7 @@ class PlanningPolicy:
             views: gives the `n` agents at this moment, in the order of the observations.
             seed: agent i's planners draw from a generator seeded with `seed + i`.
         """
-        self._views = views
-        self._seed = seed
+        self._views, self._seed = views, seed
         self._generators: list[np.random.Generator] = []
         self._planners: list[Planner | None] = []
         self._steps: list[int] = []

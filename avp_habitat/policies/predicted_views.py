@@ -1,15 +1,77 @@
-"""Which cells of a known map views should show, and which of them were not observed all the same."""
+"""What an agent knows of the floor, as a grid, and which cells of it its views should show."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.compiled import njit
-from avp_habitat.policies.known_map import BLOCKED, BODY_M, FREE, UNKNOWN, KnownMap, known_map
 from avp_habitat.sight.rules import Camera, camera_numbers, in_image
 from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.settings import TaskSettings
+
+UNKNOWN, FREE, OBSERVED, BLOCKED = range(4)
+"""FREE: navigable as far as known, but not observed yet. OBSERVED: navigable and observed. BLOCKED: not navigable."""
+BODY_M = 0.3
+"""An agent knows the floor this far around every place where it has stood, metres."""
+MARGIN_M = 2.0
+"""Unknown floor kept around the known floor, metres."""
+
+_NEIGHBOURS = np.array([(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)])
+
+
+@dataclass(frozen=True)
+class KnownMap:
+    """A grid over the known floor with a margin around it; rows along +Z, columns along +X, as in `NavigableArea`."""
+
+    state: NDArray[np.uint8]
+    """`(rows, columns)` UNKNOWN, FREE, OBSERVED or BLOCKED."""
+    first: NDArray[np.int64]
+    """`(2,)` row and column of cell (0, 0) in the scene's grid."""
+    cell_m: float
+    """Side of a cell in metres."""
+    corner: NDArray[np.float64]
+    """`(2,)` z and x of the least corner of cell (0, 0), metres."""
+
+    @property
+    def navigable(self) -> NDArray[np.bool_]:
+        """`(rows, columns)` cells known to be navigable."""
+        return (self.state == FREE) | (self.state == OBSERVED)
+
+    def at(self, point: NDArray[np.floating]) -> NDArray[np.float64]:
+        """`(2,)` row and column of a `(3,)` point in metres, in cells; a cell's centre lies at +0.5."""
+        return (np.asarray(point)[[2, 0]] - self.corner) / self.cell_m
+
+
+def known_map(view: AgentView, stood: NDArray[np.float64]) -> KnownMap:
+    """What an agent that has stood at `(k, 3)` places in metres knows about the floor.
+
+    An observed cell is navigable, and the depth image around its floor point shows which of its 8 neighbours are;
+    around its own body the agent knows the cells within `BODY_M`. Nothing else of the scene is read: the grid's size
+    follows from these cells too.
+    """
+    area = view.area
+    observed = area.cell_of(area.centres[view.observed])
+    body = _around(area.cell_of(stood), BODY_M / area.cell_m)
+    known = np.concatenate([(observed[:, None] + _NEIGHBOURS).reshape(-1, 2), body])
+    margin = int(np.ceil(MARGIN_M / area.cell_m))
+    first = known.min(axis=0) - margin
+    state = np.full(known.max(axis=0) + margin + 1 - first, UNKNOWN, dtype=np.uint8)
+    inside = ((known >= 0) & (known < area.mask.shape)).all(axis=1)
+    navigable = np.zeros(len(known), dtype=np.bool_)
+    navigable[inside] = area.mask[tuple(known[inside].T)]
+    state[tuple((known - first).T)] = np.where(navigable, FREE, BLOCKED)
+    state[tuple((observed - first).T)] = OBSERVED
+    return KnownMap(state, first, area.cell_m, area.origin[::-1] + first * area.cell_m)
+
+
+def _around(cells: NDArray[np.int64], radius: float) -> NDArray[np.int64]:
+    """`(k, 2)` cells whose centres lie within a radius, in cells, of the centres of other cells."""
+    reach = int(radius)
+    offsets = np.argwhere(np.ones((2 * reach + 1,) * 2)) - reach
+    offsets = offsets[np.hypot(*offsets.T) <= radius + 1e-9]
+    return (np.unique(cells, axis=0)[:, None] + offsets).reshape(-1, 2)
 
 
 class Lens(NamedTuple):
@@ -68,16 +130,9 @@ def clear_line(state, row, column, to_row, to_column):
 
 @njit(cache=True)
 def in_view(state, cells, row, column, yaw, pitch, lens):
-    """`(k,)` whether a camera over a point of the grid should see the centres of `(k, 2)` cells.
+    """`(k,)` whether a camera over a point of the grid should see the centres of `(k, 2)` cells; angles in radians.
 
-    Args:
-        state: `(rows, columns)` of a `KnownMap`; unknown cells hide nothing.
-        cells: `(k, 2)` rows and columns.
-        row: of the camera, in cells.
-        column: of the camera, in cells.
-        yaw: radians.
-        pitch: radians.
-        lens: of the camera.
+    `state` is that of a `KnownMap`: BLOCKED cells hide what lies behind them, unknown ones hide nothing.
     """
     seen = np.zeros(len(cells), np.bool_)
     forward_row, forward_column = -np.cos(yaw), -np.sin(yaw)
@@ -112,15 +167,9 @@ class Memory:
         height, width = self._misses.shape
         misses[row : row + height, column : column + width] = self._misses
         if view.steps:
-            missed = _should_see(view, known)
-            misses[tuple(missed.T)] = np.minimum(misses[tuple(missed.T)], 254) + 1
+            cells = np.argwhere((known.state == FREE) | (known.state == UNKNOWN))
+            here, lens = known.at(view.position), make_lens(view.settings, known.cell_m)
+            missed = tuple(cells[in_view(known.state, cells, *here, view.yaw, view.pitch, lens)].T)
+            misses[missed] = np.minimum(misses[missed], 254) + 1
         self._misses, self._first = misses, known.first
         return known, misses
-
-
-def _should_see(view: AgentView, known: KnownMap) -> NDArray[np.int64]:
-    """`(k, 2)` cells not observed that the newest view should have shown."""
-    cells = np.argwhere((known.state == FREE) | (known.state == UNKNOWN))
-    row, column = known.at(view.position)
-    lens = make_lens(view.settings, known.cell_m)
-    return cells[in_view(known.state, cells, row, column, view.yaw, view.pitch, lens)]

@@ -20,12 +20,7 @@ class RandomPolicy:
     """Any of the six actions, with equal odds."""
 
     def __init__(self, seed: int | None = None, agents: int | None = None) -> None:
-        """Start a random generator of its own.
-
-        Args:
-            seed: of it.
-            agents: n; where it is omitted, observations are arrays `(n, k)` or `(k,)`.
-        """
+        """Start a random generator of its own; without `agents`, observations are arrays `(n, k)` or `(k,)`."""
         self._rng = np.random.default_rng(seed)
         self._agents = agents
 
@@ -46,13 +41,7 @@ class HeuristicPolicy:
     """Forward while there is room ahead, else left or right with equal odds (Eq. 23); it uses three actions."""
 
     def __init__(self, centre_depth: Callable[[], NDArray[np.floating]], seed: int | None = None) -> None:
-        """Use a source of depth.
-
-        Args:
-            centre_depth: gives the `(n,)` planar depth in metres in the middle of the newest views; the twelve
-                numbers do not hold it.
-            seed: of the random generator.
-        """
+        """Use a source of the `(n,)` planar depths in metres in the middle of the newest views."""
         self._centre_depth = centre_depth
         self._rng = np.random.default_rng(seed)
 
@@ -79,8 +68,7 @@ class SpinPlanner:
     def __init__(self, rng: np.random.Generator) -> None:
         """Begin with a full circle."""
         self._rng = rng
-        self._turns = 0
-        self._walked = 0
+        self._turns = self._walked = 0
         self._aside: int | None = None
 
     def act(self, view: AgentView) -> int:
@@ -88,24 +76,17 @@ class SpinPlanner:
         if self._turns < int(np.ceil(360.0 / view.settings.turn_deg)):
             self._turns += 1
             return TURN_LEFT
-        if self._walked and view.collided:
-            return self._begin_circle()
-        if view.centre_depth <= CLEARANCE_M:
-            return self._begin_circle() if self._walked else self._turn_aside(view)
-        if self._walked * view.settings.forward_m >= WALK_M:
-            return self._begin_circle()
+        blocked = view.centre_depth <= CLEARANCE_M
+        if self._walked and (blocked or view.collided or self._walked * view.settings.forward_m >= WALK_M):
+            self._turns, self._walked, self._aside = 1, 0, None
+            return TURN_LEFT
+        if blocked:
+            # Keep to the side drawn first: turns back and forth would find no room.
+            if self._aside is None:
+                self._aside = TURN_LEFT if self._rng.random() < 0.5 else TURN_RIGHT
+            return self._aside
         self._walked += 1
         return MOVE_FORWARD
-
-    def _begin_circle(self) -> int:
-        self._turns, self._walked, self._aside = 1, 0, None
-        return TURN_LEFT
-
-    def _turn_aside(self, view: AgentView) -> int:
-        """Keep to the side drawn first: turns back and forth would find no room."""
-        if self._aside is None:
-            self._aside = TURN_LEFT if self._rng.random() < 0.5 else TURN_RIGHT
-        return self._aside
 
 
 class SpinPolicy(PlanningPolicy):

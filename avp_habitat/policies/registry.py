@@ -1,11 +1,10 @@
 """The policies by name, and one episode of a policy in `AVP-v0`, step by step."""
 
-import importlib
 import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
@@ -13,14 +12,7 @@ from numpy.typing import NDArray
 
 from avp_habitat import plugins
 from avp_habitat.errors import PolicyError, UsageError
-from avp_habitat.policies.saved_model import (
-    ALGORITHMS,
-    FOR_TRAINING,
-    NormalisedPolicy,
-    algorithm_of,
-    check_harmless,
-    statistics_of,
-)
+from avp_habitat.policies.saved_model import ALGORITHMS, NormalisedPolicy, load_model, statistics_of
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.settings import OBSERVATIONS, TaskSettings
@@ -57,44 +49,36 @@ TRUSTED = "open a model also where that may run code which its file holds: only 
 
 
 def check_policy(policy: Any) -> Any:
-    """The policy itself when there is such a one; a model's file has to have its statistics.
-
-    Args:
-        policy: as `make_policy` takes it.
+    """The policy itself, as `make_policy` takes it, when there is such a one.
 
     Raises:
         UsageError: no such name, object or file; the text names the nearest name.
-        PolicyError: the model was trained under `VecNormalize`, and its statistics are not beside it.
+        PolicyError: a model was trained under `VecNormalize`, and its statistics are not beside it.
     """
     file = _model_file(policy)
     if file is None:
         if policy not in POLICIES:  # Those are imported by who makes one.
             plugins.find("avp.policies", policy, POLICIES | {"MODEL.zip": ""})
-    elif not file.path.is_file():
+    elif not file[0].is_file():
         raise UsageError(f"--policy {policy}: no such model file")
     else:
-        statistics_of(file.path)
+        statistics_of(file[0])
     return policy
 
 
 def described(policy: Any) -> str:
     """A policy as it will act, for the screen: with the statistics by which a model sees."""
     file, name = _model_file(policy), plugins.name_of(policy)
-    statistics = None if file is None else statistics_of(file.path)
+    statistics = None if file is None else statistics_of(file[0])
     return name if statistics is None else f"{name} with the statistics {statistics}"
 
 
-class _ModelFile(NamedTuple):
-    path: Path
-    algorithm: str | None
-
-
-def _model_file(policy: Any) -> _ModelFile | None:
-    """Of `MODEL.zip` or `ALGORITHM:MODEL.zip`; None for what is no such text."""
+def _model_file(policy: Any) -> tuple[Path, str | None] | None:
+    """Path and algorithm of `MODEL.zip` or `ALGORITHM:MODEL.zip`; None for what is no such text."""
     if not isinstance(policy, str) or not policy.endswith(".zip"):
         return None
     algorithm, _, path = policy.partition(":")
-    return _ModelFile(Path(path), algorithm) if algorithm in ALGORITHMS else _ModelFile(Path(policy), None)
+    return (Path(path), algorithm) if algorithm in ALGORITHMS else (Path(policy), None)
 
 
 def make_policy(policy: Any, env: AVPEnv, seed: int, *, trusted: bool = False) -> Policy:
@@ -119,13 +103,14 @@ def make_policy(policy: Any, env: AVPEnv, seed: int, *, trusted: bool = False) -
     file = _model_file(policy)
     if file is None:
         return _made(policy, plugins.find("avp.policies", policy, POLICIES), env, seed)
-    model = load_model(file.path, algorithm=file.algorithm, trusted=trusted)
+    path, algorithm = file
+    model = load_model(path, algorithm=algorithm, trusted=trusted)
     for kind in ("observation_space", "action_space"):
         learned, offered = getattr(model, kind), getattr(env, kind)
         if learned != offered:
             raise MisfitError(f"{policy}: trained for the {kind} {learned}, but this environment has {offered}")
     model.set_random_seed(seed)
-    statistics = statistics_of(file.path)
+    statistics = statistics_of(path)
     return model if statistics is None else NormalisedPolicy(model, statistics, trusted=trusted)
 
 
@@ -143,43 +128,6 @@ def _made(policy: Any, found: Any, env: AVPEnv, seed: int) -> Policy:
     return found
 
 
-def load_model(path: Path, *, env: Any = None, trusted: bool = False, algorithm: str | None = None) -> Any:
-    """A model of Stable-Baselines3 or sb3-contrib, on the CPU.
-
-    Args:
-        path: of its `.zip`.
-        env: in which its training goes on; without it, its schedules (of the learning rate, say) are left unread, which
-            are often functions.
-        trusted: open it also where that may run code which the file holds.
-        algorithm: one of `ALGORITHMS`; what the file tells when omitted.
-
-    Raises:
-        PolicyError: it is none, needs a package that is not installed, or holds what may run code.
-        ValueError: it does not fit `env`.
-    """
-    kind = _algorithm(path, algorithm or algorithm_of(path))
-    # Who only acts needs no schedules.
-    replaced = FOR_TRAINING if env is None and not trusted else {}
-    if not trusted:
-        check_harmless(path, without=replaced)
-    try:
-        return kind.load(path, env=env, device="cpu", custom_objects=replaced)
-    except Exception as error:
-        if env is not None and isinstance(error, ValueError):
-            raise
-        # A pickle may raise anything.
-        raise PolicyError(f"{path}: expected a model of {kind.__name__}, could not load it: {error}") from None
-
-
-def _algorithm(path: Path, name: str) -> Any:
-    package = ALGORITHMS[name]
-    try:
-        return getattr(importlib.import_module(package), name)
-    except ImportError:
-        install = "'avp-suite[sb3]'" if package == "stable_baselines3" else package.replace("_", "-")
-        raise PolicyError(f"{path}: {name} needs {package}; install it with `pip install {install}`") from None
-
-
 def make_policy_env(
     policy: Any,
     simulator: Simulator,
@@ -189,31 +137,26 @@ def make_policy_env(
     observation: Any = None,
     trusted: bool = False,
 ) -> tuple[AVPEnv, Policy]:
-    """An environment, and the policy that acts in it.
+    """An environment, and the policy that acts in it; arguments that both have are those of `make_policy`.
 
-    Args:
-        policy: as `make_policy` takes it.
-        simulator: an open one.
-        settings: of the task.
-        seed: of a policy that draws at random.
-        observation: the kind; when omitted, the first one that fits, of the settings' own, those that are built in and
-            those that other distributions register: a baseline fits each, a model its own.
-        trusted: open a model's file also where that may run code which the file holds.
+    Without a kind of observation it is the first one that fits, of the settings' own, those that are built in and those
+    that other distributions register: a baseline fits each, a model its own.
 
     Raises:
         UsageError: no such policy or observation.
         PolicyError: the model cannot be loaded, or fits no kind of observation.
     """
-    first: MisfitError | None = None
-    every = [settings.observation, *plugins.names("avp.observations", OBSERVATIONS)]
-    for kind in every if observation is None else (observation,):
+    kinds = [observation]
+    if observation is None:
+        kinds = [settings.observation, *plugins.names("avp.observations", OBSERVATIONS)]
+    misfits: list[MisfitError] = []
+    for kind in kinds:
         env = AVPEnv(simulator.scene, simulator=simulator, settings=replace(settings, observation=kind))
         try:
             return env, make_policy(policy, env, seed, trusted=trusted)
         except MisfitError as error:
-            first = first or error
-    assert first is not None
-    raise first
+            misfits.append(error)
+    raise misfits[0]
 
 
 @dataclass(frozen=True)
@@ -229,13 +172,10 @@ class Step:
 
 
 def steps_of(env: gymnasium.Env, policy: Policy, *, seed: int, deterministic: bool = True) -> Iterator[Step]:
-    """Run one episode; the environment stands where each step left it while the caller has that step.
+    """Run one episode of an `AVPEnv`, which stands where each step left it while the caller has that step.
 
-    Args:
-        env: a `AVPEnv`, also a wrapped one.
-        policy: asked with its recurrent state, if it has one.
-        seed: of the start.
-        deterministic: False to sample a model's actions.
+    The policy is asked with its recurrent state, if it has one, and samples a model's actions unless `deterministic`;
+    the seed is that of the start.
     """
     observation, _ = env.reset(seed=seed)
     state: Any = None

@@ -1,10 +1,9 @@
 """A policy that Stable-Baselines3 saved: what its file would run, and the statistics of `VecNormalize` beside it."""
 
 import base64
+import importlib
 import io
 import json
-import logging
-import math
 import pickle
 import re
 import zipfile
@@ -17,8 +16,6 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import PolicyError
 
-_log = logging.getLogger(__name__)
-_NUMPY = "_reconstruct scalar _frombuffer"
 _KNOWN = {
     "collections": "deque OrderedDict",
     "gymnasium.spaces.box": "Box",
@@ -27,10 +24,11 @@ _KNOWN = {
     "gymnasium.spaces.multi_binary": "MultiBinary",
     "gymnasium.spaces.multi_discrete": "MultiDiscrete",
     "numpy": "dtype ndarray bool_ float32 float64 int8 int32 int64 uint8",
-    "numpy.core.multiarray": _NUMPY,
-    "numpy.core.numeric": _NUMPY,
-    "numpy._core.multiarray": _NUMPY,
-    "numpy._core.numeric": _NUMPY,
+    **{
+        f"numpy.{core}.{module}": "_reconstruct scalar _frombuffer"
+        for core in ("core", "_core")
+        for module in ("multiarray", "numeric")
+    },
     "numpy.random._pcg64": "PCG64",
     "numpy.random._pickle": "__bit_generator_ctor __generator_ctor",
     "numpy.random.bit_generator": "SeedSequence __pyx_unpickle_SeedSequence",
@@ -57,19 +55,13 @@ _KNOWN = {
     "torch.nn.modules.activation": "CELU ELU GELU Hardsigmoid Hardswish Hardtanh LeakyReLU LogSigmoid Mish PReLU RReLU "
     "ReLU ReLU6 SELU Sigmoid SiLU Softplus Softsign Tanh Tanhshrink",
     "torch.nn.modules.linear": "Identity",
-    "torch.optim.adadelta": "Adadelta",
-    "torch.optim.adagrad": "Adagrad",
-    "torch.optim.adam": "Adam",
-    "torch.optim.adamax": "Adamax",
-    "torch.optim.adamw": "AdamW",
-    "torch.optim.asgd": "ASGD",
-    "torch.optim.nadam": "NAdam",
-    "torch.optim.radam": "RAdam",
-    "torch.optim.rmsprop": "RMSprop",
-    "torch.optim.sgd": "SGD",
+    **{
+        f"torch.optim.{name.lower()}": name
+        for name in ("Adadelta", "Adagrad", "Adam", "Adamax", "AdamW", "ASGD", "NAdam", "RAdam", "RMSprop", "SGD")
+    },
 }
 """What models and statistics are made of: making these objects does nothing else. All else may run code."""
-FOR_TRAINING = {
+_FOR_TRAINING = {
     "learning_rate": 0.0,
     "lr_schedule": None,
     "clip_range": 0.2,
@@ -102,9 +94,6 @@ _BY_KEY = {
 _PLAIN_TYPE = re.compile(r"[biufcSUO]\d+")
 _PICKLED = ":serialized:"
 _CHECKPOINT = re.compile(r"(?P<name>.+)_(?P<steps>\d+)_steps")
-_DATA = "data"
-# Statistics see every step of their training, and those of its end serve for its best model too.
-_ENOUGH = 0.9
 # Of the last reset before normalisation; Stable-Baselines3 keeps it only where the environment is normalised.
 _TELLS_NORMALISED = "_last_original_obs"
 # Off-policy algorithms, which have none, keep it always.
@@ -123,17 +112,14 @@ class _Nothing:
     def __call__(self, *_: Any) -> Self:
         return self
 
-    def __setstate__(self, state: Any) -> None:
-        pass
-
     def __setitem__(self, key: Any, value: Any) -> None:
         pass
 
-    def append(self, value: Any) -> None:
+    def __setstate__(self, state: Any) -> None:
+        # Of exactly two arguments: where a pickle means the class itself, whose state would last, it fails.
         pass
 
-    def extend(self, values: Any) -> None:
-        pass
+    append = extend = __setstate__
 
 
 class _NumpyType(_Nothing):
@@ -168,11 +154,8 @@ class _KnownObjects(pickle.Unpickler):
 def check_harmless(path: Path, *, without: Collection[str] = ()) -> None:
     """Refuse a model (`.zip`) or statistics (`.pkl`) whose pickles could run anything but what such files consist of.
 
-    Nothing is called and nothing made, also not to find out.
-
-    Args:
-        path: of the file.
-        without: of a model, the attributes that are not opened.
+    Nothing is called and nothing made, also not to find out. Attributes of a model `without` which it is opened are
+    not looked at.
 
     Raises:
         PolicyError: there is something else in it, or it cannot be read.
@@ -207,18 +190,51 @@ def algorithm_of(path: Path) -> str:
     Raises:
         PolicyError: it is of none of them, or does not tell.
     """
-    if not zipfile.is_zipfile(path):
-        raise PolicyError(f"{path}: {_expected(path)}, found another kind of file")
+    data = _data(path)
     try:
-        data = _data(path)
         module = str(data["policy_class"]["__module__"])
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError) as error:
         raise PolicyError(f"{path}: {_expected(path)}, could not load it: {error}") from None
     told = [name for start, name in _BY_POLICY.items() if module.startswith(start)]
     told += [name for key, name in _BY_KEY.items() if key in data]
     if not told:
         raise PolicyError(f"{path}: {_expected(path)}, found one of {module}; if it is, say which, as PPO:{path}")
     return told[0]
+
+
+def load_model(path: Path, *, env: Any = None, trusted: bool = False, algorithm: str | None = None) -> Any:
+    """A model of Stable-Baselines3 or sb3-contrib, on the CPU.
+
+    Args:
+        path: of its `.zip`.
+        env: in which its training goes on; without it, what only training needs is left unread.
+        trusted: open it also where that may run code which the file holds.
+        algorithm: one of `ALGORITHMS`; what the file tells when omitted.
+
+    Raises:
+        PolicyError: it is none, needs a package that is not installed, or holds what may run code.
+        ValueError: it does not fit `env`.
+    """
+    kind = _algorithm(path, algorithm or algorithm_of(path))
+    replaced = _FOR_TRAINING if env is None and not trusted else {}
+    if not trusted:
+        check_harmless(path, without=replaced)
+    try:
+        return kind.load(path, env=env, device="cpu", custom_objects=replaced)
+    except Exception as error:
+        if env is not None and isinstance(error, ValueError):
+            raise
+        # A pickle may raise anything.
+        raise PolicyError(f"{path}: expected a model of {kind.__name__}, could not load it: {error}") from None
+
+
+def _algorithm(path: Path, name: str) -> Any:
+    package = ALGORITHMS[name]
+    try:
+        return getattr(importlib.import_module(package), name)
+    except ImportError:
+        install = "'avp-suite[sb3]'" if package == "stable_baselines3" else package.replace("_", "-")
+        raise PolicyError(f"{path}: {name} needs {package}; install it with `pip install {install}`") from None
 
 
 def is_normalised(path: Path) -> bool | None:
@@ -228,14 +244,17 @@ def is_normalised(path: Path) -> bool | None:
     """
     try:
         data = _data(path)
-        return data.get(_TELLS_NORMALISED) is not None if _ON_POLICY in data else None
-    except (OSError, KeyError, TypeError, ValueError, AttributeError, zipfile.BadZipFile):
+    except PolicyError:
         return False
+    return data.get(_TELLS_NORMALISED) is not None if _ON_POLICY in data else None
 
 
 def _data(path: Path) -> dict[str, Any]:
-    with zipfile.ZipFile(path) as archive:
-        return json.loads(archive.read(_DATA))
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return json.loads(archive.read("data"))
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise PolicyError(f"{path}: {_expected(path)}, could not load it: {error}") from None
 
 
 def statistics_names(path: Path) -> list[Path]:
@@ -249,9 +268,8 @@ def statistics_names(path: Path) -> list[Path]:
     if steps := _CHECKPOINT.fullmatch(path.stem):
         found.append(path.with_name(f"{steps['name']}_vecnormalize_{steps['steps']}_steps.pkl"))
     run = folder.resolve().name
-    found += [
-        folder / run[: match.start()] / "vecnormalize.pkl" for match in reversed(list(re.finditer(r"_\d+(?=_|$)", run)))
-    ]
+    ends = reversed([match.start() for match in re.finditer(r"_\d+(?=_|$)", run)])
+    found += [folder / run[:end] / "vecnormalize.pkl" for end in ends]
     return [*found, folder / "vec_normalize.pkl", folder / "vecnormalize.pkl"]
 
 
@@ -276,15 +294,11 @@ def statistics_of(path: Path) -> Path | None:
 
 
 def load_statistics(path: Path, space: Any, *, trusted: bool = False) -> Any:
-    """The `VecNormalize` of a model, without an environment.
-
-    Args:
-        path: of the statistics' file.
-        space: of the observations.
-        trusted: open it whatever it holds.
+    """The `VecNormalize` of a model for observations of a space, without an environment.
 
     Raises:
-        PolicyError: it holds what may run code, something else, or the statistics of other observations.
+        PolicyError: it holds what may run code and is not `trusted`, something else, or the statistics of other
+            observations.
     """
     from stable_baselines3.common.vec_env import VecNormalize
 
@@ -306,31 +320,12 @@ def load_statistics(path: Path, space: Any, *, trusted: bool = False) -> Any:
     return found
 
 
-def _observations(statistics: Any) -> float:
-    """From how many observations statistics were computed; infinity where they do not count."""
-    found = statistics.obs_rms if statistics.norm_obs else None
-    counts = found.values() if isinstance(found, dict) else [found]
-    return min((each.count for each in counts if each is not None), default=math.inf)
-
-
 class NormalisedPolicy:
     """A model that sees observations as in its training under `VecNormalize`."""
 
     def __init__(self, model: Any, statistics: Path, *, trusted: bool = False) -> None:
-        """Join a model and the file of its statistics.
-
-        Raises:
-            PolicyError: as `load_statistics`.
-        """
+        """Join a model and the file of its statistics; errors are those of `load_statistics`."""
         self._model, self._statistics = model, load_statistics(statistics, model.observation_space, trusted=trusted)
-        seen, steps = _observations(self._statistics), model.num_timesteps
-        if seen < _ENOUGH * steps:
-            _log.warning(
-                "%s: computed from %.0f observations, but the model was trained for %d steps: are they its own?",
-                statistics,
-                seen,
-                steps,
-            )
         self.avp_mlflow_run_id = getattr(model, "avp_mlflow_run_id", None)
 
     def predict(

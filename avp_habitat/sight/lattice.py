@@ -44,13 +44,9 @@ class Lattice:
         return int(np.ceil(columns * share)) + 2, int(np.ceil(rows * share)) + 2
 
     def around(self, position: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """The lattice points around places.
+        """The `(k, 4, 2)` i and j of the lattice points around `(k, 3)` places over the area, metres.
 
-        Args:
-            position: `(k, 3)` metres, over the area.
-
-        Returns:
-            `(k, 4, 2)` their i and j, and `(k, 4)` their weights of bilinear interpolation, which sum to 1.
+        With them their `(k, 4)` weights of bilinear interpolation, which sum to 1.
         """
         at = (np.asarray(position)[:, [0, 2]] - self.area.origin) / self.spacing_m
         low = np.clip(np.floor(at), 0, np.array(self.shape) - 2)
@@ -98,8 +94,7 @@ class Lattice:
 def cache_folder() -> Path | None:
     """Where tables are kept: `$AVP_CACHE`, else `avp` in the user's cache folder.
 
-    Returns:
-        None when `$AVP_CACHE` is empty, or the user has no home, as in some containers.
+    None when `$AVP_CACHE` is empty, or the user has no home, as in some containers.
     """
     chosen = os.environ.get(CACHE_VARIABLE)
     if chosen is not None:
@@ -116,16 +111,13 @@ class TileFiles:
 
     def __init__(self, name: str) -> None:
         """Use the folder `name` of the cache."""
-        self._name = name
-        folder = cache_folder()
+        self._name, folder = name, cache_folder()
         self._folder = None if folder is None else folder / "tables" / name
 
     def read(self, tile: tuple[int, int], points: NDArray[np.integer], like: Columns) -> dict[str, NDArray] | None:
         """A tile's columns, or None where there is no sound file for these `(k, 2)` points and columns."""
-        if self._folder is None:
-            return None
         try:
-            data = _path(self._folder, tile).read_bytes()
+            data = b"" if self._folder is None else _path(self._folder, tile).read_bytes()
         except OSError:
             return None
         content, digest = data[:-_DIGEST_BYTES], data[-_DIGEST_BYTES:]
@@ -171,12 +163,9 @@ class PlaceTable:
             empty: each column by name, without rows.
             compute: the columns of `(k, 3)` feet, metres.
         """
-        self.lattice = lattice
-        """The places."""
+        self.lattice, self.name = lattice, name
         self.columns = dict(empty)
         """By name; the first axis of each is the slot."""
-        self.name = name
-        """Of its files."""
         self._files = TileFiles(name)
         self._empty = empty
         self._compute = compute
@@ -185,14 +174,7 @@ class PlaceTable:
         self._tiles: set[tuple[int, int]] = set()
 
     def around(self, position: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-        """The slots around places, made now where they are new.
-
-        Args:
-            position: `(k, 3)` feet, metres.
-
-        Returns:
-            `(k, 4)` slots and `(k, 4)` weights that sum to 1.
-        """
+        """The `(k, 4)` slots around `(k, 3)` feet in metres, made now where they are new, and their weights."""
         points, weight = self.lattice.around(position)
         slots = self._slot[points[..., 0], points[..., 1]]
         if (slots < 0).any():

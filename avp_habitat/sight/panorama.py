@@ -42,30 +42,23 @@ class Samples:
     """The first so many samples fill the image evenly and give the mean; the others, on its border, only the least."""
 
 
-def directions() -> NDArray[np.float64]:
-    """`(AZIMUTHS, ELEVATIONS, 3)` unit vectors of a panorama, world frame; azimuth 0 is yaw 0, left is positive."""
+def look_around(simulator: SingleRays, eye: Float) -> Float:
+    """`(k, AZIMUTHS, ELEVATIONS)` metres from `(k, 3)` places, inf where nothing is hit.
+
+    Azimuth 0 is yaw 0, left is positive; the elevations go from straight down to straight up.
+    """
     azimuth = np.radians(STEP_DEG) * np.arange(AZIMUTHS)[:, None]
     elevation = np.radians(STEP_DEG) * np.arange(ELEVATIONS)[None] - np.pi / 2
     flat = np.cos(elevation)
     parts = (-np.sin(azimuth) * flat, np.sin(elevation) + 0 * azimuth, -np.cos(azimuth) * flat)
-    return np.stack(np.broadcast_arrays(*parts), axis=-1)
-
-
-def look_around(simulator: SingleRays, eye: Float) -> Float:
-    """`(k, AZIMUTHS, ELEVATIONS)` metres along `directions()` from `(k, 3)` places, inf where nothing is hit."""
-    ways = directions().reshape(-1, 3)
+    ways = np.stack(np.broadcast_arrays(*parts), axis=-1).reshape(-1, 3)
     distance = simulator.distance(np.repeat(eye, len(ways), axis=0), np.tile(ways, (len(eye), 1)))
     return distance.reshape(len(eye), AZIMUTHS, ELEVATIONS)
 
 
 @lru_cache(maxsize=4)
 def view_samples(intrinsics: Intrinsics, pitches: tuple[float, ...]) -> Samples:
-    """The samples of views with the given pitches.
-
-    Args:
-        intrinsics: of the depth image whose statistics are wanted.
-        pitches: radians.
-    """
+    """The samples of views with the given pitches in radians, in a depth image with the given intrinsics."""
     width, height = intrinsics.width, intrinsics.height
     columns, rows = (np.arange(_COLUMNS) + 0.5) / _COLUMNS * width, (np.arange(_ROWS) + 0.5) / _ROWS * height
     # The least depth often lies on the border (the floor at the lower one), so the outermost pixels are sampled too.
@@ -85,12 +78,12 @@ def view_statistics(distance: Float, samples: Samples, max_range_m: float) -> ND
     """Least and mean planar depth of the views from k points, for all yaws and pitches.
 
     Args:
-        distance: `(k, AZIMUTHS, ELEVATIONS)` metres along `directions()`, inf where nothing is hit.
+        distance: `(k, AZIMUTHS, ELEVATIONS)` as `look_around` gives it.
         samples: of the views.
         max_range_m: what the whole range of the numbers stands for; larger depths count as this.
 
     Returns:
-        `(k, YAWS, pitches, 2)` least and mean depth as shares of the range, in units of 1 / 65535.
+        `(k, YAWS, pitches, 2)` as shares of the range, in units of 1 / 65535.
     """
     inverse = (1.0 / np.maximum(distance, 1e-3)).astype(np.float32)
     result = np.empty((len(distance), YAWS, len(samples.azimuth), 2), np.uint16)

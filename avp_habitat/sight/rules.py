@@ -89,12 +89,7 @@ def _inverse(depth, row, column):
 
 
 def candidates(
-    camera_to_world: Float,
-    intrinsics: Intrinsics,
-    points: Float,
-    unseen: NDArray[np.bool_],
-    *,
-    max_range_m: float,
+    camera_to_world: Float, intrinsics: Intrinsics, points: Float, unseen: NDArray[np.bool_], *, max_range_m: float
 ) -> NDArray[np.int64]:
     """Pairs (camera, point) whose point lies inside the image and within range, and was not seen before.
 
@@ -108,10 +103,8 @@ def candidates(
     Returns:
         `(k, 2)` indices, ordered by camera and point.
     """
-    wanted = np.ascontiguousarray(unseen)
-    return np.argwhere(
-        _in_views(_whole(camera_to_world), _whole(points), wanted, camera_numbers(intrinsics), max_range_m)
-    )
+    pose, wanted, camera = _whole(camera_to_world), np.ascontiguousarray(unseen), camera_numbers(intrinsics)
+    return np.argwhere(_in_views(pose, _whole(points), wanted, camera, max_range_m))
 
 
 def pairs_in_image(
@@ -130,7 +123,7 @@ def visible_in_depth(
     *,
     tolerance_m: float,
 ) -> NDArray[np.bool_]:
-    """Whether depth images show points: inside the image, and reached by the camera ray through it.
+    """`(k,)` whether depth images show points: inside the image, and reached by the camera ray through it.
 
     Args:
         camera_to_world: `(n, 4, 4)` habitat poses.
@@ -139,9 +132,6 @@ def visible_in_depth(
         points: `(m, 3)` metres, world frame.
         pairs: `(k, 2)` rows (camera, point).
         tolerance_m: a hit this close before the point still reaches it, metres along the ray.
-
-    Returns:
-        `(k,)`.
     """
     pose, rows = _whole(camera_to_world), _whole(pairs, np.int64)
     images = np.ascontiguousarray(depth)
@@ -149,15 +139,9 @@ def visible_in_depth(
 
 
 def view_quality(eye: Float, points: Float, normals: Float) -> NDArray[np.float64]:
-    """How well surface points are seen from places; see `quality`.
+    """`(k, m)` how well `(m, 3)` points with unit normals are seen from `(k, 3)` places, metres; see `quality`.
 
-    Args:
-        eye: `(k, 3)` metres.
-        points: `(m, 3)` metres.
-        normals: `(m, 3)` unit vectors.
-
-    Returns:
-        `(k, m)` within [0, 1], wherever a point lies in the image and whatever lies between.
+    It is so wherever a point lies in the image and whatever lies between.
     """
     return _view_quality(_whole(eye), _whole(points), _whole(normals))
 

@@ -10,6 +10,7 @@ import hashlib
 import weakref
 from collections.abc import Callable, Hashable
 from dataclasses import astuple
+from functools import wraps
 from typing import Any, TypeVar
 
 import numpy as np
@@ -38,11 +39,7 @@ _SIDE = Intrinsics.from_hfov(640, 640, hfov_deg=91.0)
 
 
 def single_rays(simulator: Simulator, asker: str) -> SingleRays:
-    """The simulator itself, where it casts single rays.
-
-    Args:
-        simulator: any.
-        asker: option that needs them, for the error's text.
+    """The simulator itself, where it casts single rays; `asker` is the option that needs them.
 
     Raises:
         UsageError: it shows whole images only.
@@ -60,15 +57,7 @@ def reached_around(
 ) -> NDArray[np.bool_]:
     """Whether rays reach points in any direction: cast one by one where the simulator can, else read in panoramas.
 
-    Args:
-        simulator: of the scene.
-        eye: `(n, 3)` metres, world frame.
-        points: `(m, 3)` metres, world frame.
-        pairs: `(k, 2)` rows (eye, point).
-        tolerance_m: a hit this close before the point still reaches it, metres along the ray.
-
-    Returns:
-        `(k,)`.
+    As `SingleRays.reached`: `(k,)` for `(k, 2)` rows (eye, point) of `(n, 3)` and `(m, 3)` metres, world frame.
     """
     if isinstance(simulator, SingleRays):
         return simulator.reached(eye, points, pairs, tolerance_m=tolerance_m)
@@ -81,17 +70,10 @@ def reached_around(
 
 
 def seen_bits(simulator: Simulator, eye: Float, points: Float, *, reach_m: Float | float, tolerance_m: float) -> Bits:
-    """Look from every place at every point in reach.
+    """`(k, words)` bit sets of the `(m, 3)` points that are seen from each of `(k, 3)` places, metres.
 
-    Args:
-        simulator: of the scene.
-        eye: `(k, 3)` places, metres.
-        points: `(m, 3)` metres.
-        reach_m: points farther away are not seen, metres; one number, or `(m,)`.
-        tolerance_m: a hit this close before a point still reaches it, metres along the ray.
-
-    Returns:
-        `(k, words)` bit sets of the points that are seen from each place.
+    Points farther away than `reach_m`, one number or `(m,)`, are not seen; a hit within `tolerance_m` before a point
+    still reaches it.
     """
     pairs = np.argwhere(((points[None] - eye[:, None]) ** 2).sum(axis=-1) <= np.square(reach_m))
     seen = reached_around(simulator, eye, points, pairs, tolerance_m=tolerance_m)
@@ -103,18 +85,27 @@ def seen_bits(simulator: Simulator, eye: Float, points: Float, *, reach_m: Float
 _kept: weakref.WeakKeyDictionary[Simulator, dict[Hashable, Any]] = weakref.WeakKeyDictionary()
 
 
-def once_per_simulator(simulator: Simulator, key: Hashable, make: Callable[[], Made]) -> Made:
-    """What was made of an open simulator before, or is made now; it lives as long as the simulator.
+def once_per_simulator(*needed: str) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
+    """Lets a function of (simulator, settings, **options) make its result once for each open simulator.
+
+    The result lives as long as the simulator, which it must not hold; `__wrapped__` makes one that is not kept.
 
     Args:
-        simulator: which the result must not hold.
-        key: what is made, and all that it depends on besides the simulator.
-        make: makes it.
+        needed: the settings on which the result depends, by name.
     """
-    known = _kept.setdefault(simulator, {})
-    if key not in known:
-        known[key] = make()
-    return known[key]
+
+    def decorate(make: Callable[..., Made]) -> Callable[..., Made]:
+        @wraps(make)
+        def kept(simulator: Simulator, settings: TaskSettings, **options: Any) -> Made:
+            known = _kept.setdefault(simulator, {})
+            key = make, *(getattr(settings, name) for name in needed), *sorted(options.items())
+            if key not in known:
+                known[key] = make(simulator, settings, **options)
+            return known[key]
+
+        return kept
+
+    return decorate
 
 
 def pitches(settings: TaskSettings) -> tuple[float, ...]:
@@ -123,6 +114,7 @@ def pitches(settings: TaskSettings) -> tuple[float, ...]:
     return tuple(np.radians(panorama.PITCH_STEP_DEG * np.arange(-most, most + 1)).tolist())
 
 
+@once_per_simulator("sensor_height_m", "intrinsics", "pitch_limit_deg", "max_range_m", "tolerance_m")
 def scene_tables(simulator: SingleRays, settings: TaskSettings) -> PlaceTable:
     """The tables for a scene and a task; tasks on the same open simulator share them.
 
@@ -130,37 +122,16 @@ def scene_tables(simulator: SingleRays, settings: TaskSettings) -> PlaceTable:
         Columns `visible`, `(slots, words)` bit sets of the cells seen from each place, and `statistics`, `(slots,
         yaws, pitches, 2)` least and mean depth, 65535 for the whole range.
     """
-    key = ("cells", *_numbers(settings))
-    return once_per_simulator(simulator, key, lambda: make_scene_tables(simulator, settings))
-
-
-def _numbers(settings: TaskSettings) -> tuple[Any, ...]:
-    """What the tables depend on besides the scene."""
     camera = settings.sensor_height_m, astuple(settings.intrinsics), settings.pitch_limit_deg
-    return *camera, settings.max_range_m, settings.tolerance_m, SPACING_M
-
-
-def make_scene_tables(simulator: SingleRays, settings: TaskSettings) -> PlaceTable:
-    """Tables as `scene_tables` gives them, shared with nobody."""
+    numbers = *camera, settings.max_range_m, settings.tolerance_m, SPACING_M
     # Bits stand for cells: another NavMesh of the same scene has others.
     cells = simulator.area.centres
-    name = hashlib.sha256(cells.tobytes() + f"{simulator.scene_digest} {_VERSION} {_numbers(settings)}".encode())
-    samples = panorama.view_samples(settings.intrinsics, pitches(settings))
-    empty = {"statistics": np.zeros((0, panorama.YAWS, len(pitches(settings)), 2), dtype=np.uint16)}
-
-    def statistics(rays: SingleRays, eye: Float) -> Columns:
-        return {"statistics": panorama.view_statistics(panorama.look_around(rays, eye), samples, settings.max_range_m)}
-
-    return point_table(simulator, settings, cells, name.hexdigest(), empty, statistics)
+    name = hashlib.sha256(cells.tobytes() + f"{simulator.scene_digest} {_VERSION} {numbers}".encode())
+    return point_table(simulator, settings, cells, name.hexdigest(), statistics=True)
 
 
 def point_table(
-    simulator: SingleRays,
-    settings: TaskSettings,
-    points: Float,
-    digest: str,
-    empty: Columns | None = None,
-    further: Callable[[SingleRays, Float], Columns] = lambda rays, eye: {},
+    simulator: SingleRays, settings: TaskSettings, points: Float, digest: str, *, statistics: bool = False
 ) -> PlaceTable:
     """A table whose column `visible` holds the bit sets of the points seen from each place.
 
@@ -169,17 +140,23 @@ def point_table(
         settings: of the task.
         points: `(m, 3)` metres.
         digest: of all that the columns follow from, hexadecimal.
-        empty: further columns by name, without rows.
-        further: those columns, of a simulator and `(k, 3)` places of cameras in metres.
+        statistics: whether it has a column `statistics` as well, as `scene_tables` describes it.
     """
     # Not held: the table lives as long as the simulator, whose users hold it.
     rays: SingleRays = weakref.proxy(simulator)
     # A place is less than a lattice diagonal away from its points, so that points a little out of range count too.
     reach_m, tolerance_m = settings.max_range_m + 2 * SPACING_M, settings.tolerance_m
+    samples = panorama.view_samples(settings.intrinsics, pitches(settings))
+    empty: dict[str, NDArray] = {"visible": np.zeros((0, words_for(len(points))), dtype=np.uint64)}
+    if statistics:
+        empty["statistics"] = np.zeros((0, panorama.YAWS, len(samples.azimuth), 2), dtype=np.uint16)
 
     def compute(feet: Float) -> Columns:
         eye = feet + [0.0, settings.sensor_height_m, 0.0]
-        return {"visible": seen_bits(rays, eye, points, reach_m=reach_m, tolerance_m=tolerance_m), **further(rays, eye)}
+        rows: dict[str, NDArray] = {"visible": seen_bits(rays, eye, points, reach_m=reach_m, tolerance_m=tolerance_m)}
+        if statistics:
+            around = panorama.look_around(rays, eye)
+            rows["statistics"] = panorama.view_statistics(around, samples, settings.max_range_m)
+        return rows
 
-    columns = {"visible": np.zeros((0, words_for(len(points))), dtype=np.uint64), **(empty or {})}
-    return PlaceTable(Lattice(simulator.area, SPACING_M), digest[:32], columns, compute)
+    return PlaceTable(Lattice(simulator.area, SPACING_M), digest[:32], empty, compute)

@@ -70,20 +70,19 @@ class Visibility:
     def figures(self) -> dict[str, float]:
         """Shares of the tested pixels, within [0, 1]; no figure at all when no pixel shows a surface.
 
-        Returns:
-            visibility (seen by a frame), visibility_2_frames and visibility_3_frames (by so many or more),
-            visibility_alike, visibility_parallax, and visibility_weighted (mean likeness).
+        visibility: seen by a frame; visibility_2_frames: by two or more; visibility_weighted: mean likeness.
         """
         if not len(self.view):
             return {}
-        return {
-            "visibility": float(np.mean(self.count >= 1)),
-            "visibility_2_frames": float(np.mean(self.count >= 2)),
-            "visibility_3_frames": float(np.mean(self.count >= 3)),
-            "visibility_alike": float(self.alike.mean()),
-            "visibility_parallax": float(self.parallax.mean()),
-            "visibility_weighted": float(self.likeness.mean()),
+        figures = {
+            "visibility": self.count >= 1,
+            "visibility_2_frames": self.count >= 2,
+            "visibility_3_frames": self.count >= 3,
+            "visibility_alike": self.alike,
+            "visibility_parallax": self.parallax,
+            "visibility_weighted": self.likeness,
         }
+        return {name: float(np.mean(values)) for name, values in figures.items()}
 
     def per_view(self) -> NDArray[np.float64]:
         """`(views,)` share of each held-out view's tested pixels that a frame saw; NaN where it shows no surface."""
@@ -103,15 +102,10 @@ def grid_stride(intrinsics: Intrinsics, pixels: int = PIXELS_PER_VIEW) -> int:
 
 
 def heldout_points(views: Iterable[DepthView], intrinsics: Intrinsics, *, stride: int) -> HeldoutPoints:
-    """The surface points of a regular grid of pixels of each held-out view; pixels without depth are left out.
+    """The surface points of every `stride`-th row and column of each held-out view; pixels without depth are left out.
 
     Each view's grid begins at a row and column of its own, the same ones every time, so that edges that lie alike in
     many views do not fall through all grids together.
-
-    Args:
-        views: held-out depth pictures with their poses.
-        intrinsics: of all of them.
-        stride: every so many-th row and column; 1 takes all pixels.
 
     Raises:
         ValueError: the stride is below 1.
@@ -135,16 +129,13 @@ def heldout_points(views: Iterable[DepthView], intrinsics: Intrinsics, *, stride
 
 
 def points_seen(depth: Float, camera_to_world: Float, intrinsics: Intrinsics, points: Float) -> NDArray[np.int64]:
-    """Which points a frame sees.
+    """`(k,)` which points a frame sees, by ascending index.
 
     Args:
         depth: `(height, width)` planar depth in metres, 0 where nothing was hit.
         camera_to_world: `(4, 4)` habitat pose.
         intrinsics: of the frame.
         points: `(m, 3)` metres, world frame.
-
-    Returns:
-        `(k,)` their indices, ascending.
     """
     # Late, so that who only asks for the limits above, as every table of figures does, loads no Numba.
     from avp_habitat.sight.rules import agreeing_depths, camera_numbers
@@ -155,13 +146,7 @@ def points_seen(depth: Float, camera_to_world: Float, intrinsics: Intrinsics, po
 
 
 def visibility(points: HeldoutPoints, frames: Iterable[DepthView], intrinsics: Intrinsics) -> Visibility:
-    """Look for the surfaces of held-out pixels in captured frames, one frame in memory at a time.
-
-    Args:
-        points: of the held-out pixels.
-        frames: captured depth pictures with their poses, in the order of capture.
-        intrinsics: of all of them.
-    """
+    """Look for the surfaces of held-out pixels in captured frames, in the order of capture, one in memory at a time."""
     total, number = len(points.xyz), 0
     count, first = np.zeros(total, np.int64), np.zeros(total, np.int64)
     likeness, alike, parallax = np.zeros(total), np.zeros(total, bool), np.zeros(total, bool)

@@ -29,12 +29,7 @@ class SurfaceMapper:
     """Draws the maps of agents in one scene."""
 
     def __init__(self, surface: SceneSurface, sensor_height_m: float) -> None:
-        """Sort the scene's points by what they face.
-
-        Args:
-            surface: of the scene.
-            sensor_height_m: of the camera above the feet, metres.
-        """
+        """Sort the scene's points by what they face; the height is that of the camera above the feet, metres."""
         self._points = surface.points
         self._height_m = sensor_height_m
         upwards = surface.normals[:, 1]
@@ -60,30 +55,22 @@ class SurfaceMapper:
         """
         maps = np.zeros((len(rows), len(GROUPS), 2, SIDE, SIDE), dtype=np.float32)
         eye = np.asarray(position) + [0.0, self._height_m, 0.0]
-        _draw(self._points, self._facing, quality, rows, eye, np.asarray(yaw), CELL_M, maps)
+        _draw(self._points, self._facing, quality, rows, eye, np.asarray(yaw), maps)
         maps[:, :, 1] /= np.maximum(maps[:, :, 0], 1.0)
         maps[:, :, 0] /= FULL
         return np.minimum(maps, 1.0).reshape(len(rows), SIZE)
 
 
 @njit(cache=True)
-def _draw(points, facing, quality, rows, eye, yaw, cell_m, maps):
-    """Count the surface points seen, and sum their qualities, by group and map cell.
+def _draw(points, facing, quality, rows, eye, yaw, maps):
+    """Count the surface points seen, and sum their qualities, by group and cell of `(k, 4, 2, side, side)` maps.
 
-    Args:
-        points: `(m, 3)` metres.
-        facing: `(m,)` 1 up, 0 sideways, -1 down.
-        quality: `(n, m)` how well each was seen, 0 for never.
-        rows: `(k,)` the agents' rows of it.
-        eye: `(k, 3)` the agents' cameras, metres.
-        yaw: `(k,)` radians.
-        cell_m: side of a map cell, metres.
-        maps: `(k, 4, 2, side, side)` output, zeros before.
+    The maps are zeros before. `facing` `(m,)` is 1 up, 0 sideways, -1 down; `eye` `(k, 3)` are the cameras, metres.
     """
     side = maps.shape[3]
     for k in range(len(rows)):
         seen = quality[rows[k]]
-        ahead_x, ahead_z = -np.sin(yaw[k]) / cell_m, -np.cos(yaw[k]) / cell_m
+        ahead_x, ahead_z = -np.sin(yaw[k]) / CELL_M, -np.cos(yaw[k]) / CELL_M
         for j in range(len(points)):
             if seen[j] > 0:
                 x, z = points[j, 0] - eye[k, 0], points[j, 2] - eye[k, 2]

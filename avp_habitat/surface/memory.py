@@ -21,14 +21,9 @@ Rows = NDArray[np.integer]
 _VERSION = 1
 
 
+@once_per_simulator("sensor_height_m", "max_range_m", "tolerance_m")
 def surface_tables(simulator: SingleRays, settings: TaskSettings) -> PlaceTable:
     """Which surface points are seen from the places asked for; tasks on the same open simulator share them."""
-    key = ("surface tables", settings.sensor_height_m, settings.max_range_m, settings.tolerance_m)
-    return once_per_simulator(simulator, key, lambda: make_surface_tables(simulator, settings))
-
-
-def make_surface_tables(simulator: SingleRays, settings: TaskSettings) -> PlaceTable:
-    """Tables as `surface_tables` gives them, shared with nobody."""
     points = scene_surface(simulator, settings).points
     reach_m = settings.max_range_m + 2 * SPACING_M
     numbers = (settings.sensor_height_m, settings.tolerance_m, reach_m, SPACING_M)
@@ -41,13 +36,7 @@ class RoomSurface:
     """The memory of the agents in one scene; n is the number of all agents, also those elsewhere."""
 
     def __init__(self, simulator: Simulator, settings: TaskSettings, agents: int, rows: Rows) -> None:
-        """Make room.
-
-        Args:
-            simulator: of the scene.
-            settings: of the task.
-            agents: n.
-            rows: `(k,)` which of them are in this scene.
+        """Make room for the `(k,)` rows of those of all agents that are in the scene.
 
         Raises:
             UsageError: the simulator cannot do what the settings ask for, or the scene shows no surface.
@@ -67,9 +56,8 @@ class RoomSurface:
 
     def capture(self, views: Views, rows: Rows) -> NDArray[np.float64]:
         """`(k,)` ΔS of the newest views of k agents, which are remembered."""
-        if self._rays is None:
-            return self._cast(views, self._row[rows])
-        return self._look_up(self._rays, views, self._row[rows])
+        rows = self._row[rows]
+        return self._cast(views, rows) if self._rays is None else self._look_up(self._rays, views, rows)
 
     def observe(self, rows: Rows, position: Float, yaw: Float) -> NDArray[np.float32]:
         """`(k, surface.map.SIZE)` what k agents know of the surface; see `SurfaceMapper.observe`."""
@@ -105,21 +93,10 @@ class RoomSurface:
         return gain
 
 
-def raise_quality(
-    quality: NDArray[np.float32],
-    rows: Rows,
-    agent: NDArray[np.integer],
-    point: NDArray[np.integer],
-    value: NDArray[np.float32],
-) -> NDArray[np.float64]:
-    """Enter greater qualities.
+def raise_quality(quality: Float, rows: Rows, agent: Rows, point: Rows, value: Float) -> NDArray[np.float64]:
+    """Enter greater qualities `value` `(p,)` into `quality` `(n, m)`, whose `rows` `(k,)` are the agents'.
 
-    Args:
-        quality: `(n, m)`, changed in place.
-        rows: `(k,)` the agents' rows of it.
-        agent: `(p,)` indices into `rows`.
-        point: `(p,)`, each pair (agent, point) at most once.
-        value: `(p,)` greater than what is there.
+    Each pair of `agent` `(p,)`, an index into `rows`, and `point` `(p,)` is there at most once.
 
     Returns:
         `(k,)` sums of the growth.

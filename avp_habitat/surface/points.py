@@ -51,12 +51,7 @@ class SceneSurface:
 
 
 def views_all_over(simulator: Simulator, settings: TaskSettings) -> Iterator[SampledView]:
-    """What is seen all around from places all over the floor, the same ones every time.
-
-    Args:
-        simulator: of the scene.
-        settings: of the task: sensor height and range.
-    """
+    """What is seen all around from places all over the floor, the same ones every time."""
     centres = simulator.area.centres
     places = centres[np.unique(np.linspace(0, len(centres) - 1, min(len(centres), _PLACES)).astype(int))]
     yaw, pitch = (np.radians(grid.ravel()) for grid in np.meshgrid(_YAWS_DEG, _PITCHES_DEG))
@@ -68,6 +63,7 @@ def views_all_over(simulator: Simulator, settings: TaskSettings) -> Iterator[Sam
             yield SampledView(place, each, np.asarray(unproject(image, each, _CAMERA), dtype=np.float64), hit)
 
 
+@once_per_simulator("sensor_height_m", "max_range_m")
 def scene_surface(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
     """The surface of a scene; found once for an open simulator.
 
@@ -76,11 +72,6 @@ def scene_surface(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
     Raises:
         UsageError: the scene shows no surface at all.
     """
-    key = ("surface", settings.sensor_height_m, settings.max_range_m)
-    return once_per_simulator(simulator, key, lambda: _find(simulator, settings))
-
-
-def _find(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
     found: list[NDArray[np.float64]] = [np.zeros((0, 7))]
     for view in views_all_over(simulator, settings):
         eye = view.camera_to_world[:3, 3]
@@ -89,9 +80,7 @@ def _find(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
         found.append(_best(np.column_stack([points, normals, view_quality(eye[None], points, normals)[0]])))
     rows = _best(np.concatenate(found))
     if not len(rows):
-        raise UsageError(
-            f"reward or observation of surfaces: {simulator.scene} shows none; expected walls or furniture"
-        )
+        raise UsageError(f"reward or observation surface: {simulator.scene} shows none; expected walls or furniture")
     return SceneSurface(np.ascontiguousarray(rows[:, :3]), np.ascontiguousarray(rows[:, 3:6]))
 
 

@@ -11,7 +11,6 @@ from shapes import furnished, mesh_of, write_room
 
 from avp_habitat.policies.oracle.places import scene_places
 from avp_habitat.policies.oracle.policy import OraclePolicy, SurveyPolicy
-from avp_habitat.policies.oracle.search import BeamSettings
 from avp_habitat.poses import Intrinsics, camera_to_world
 from avp_habitat.scenes.loader import Scene
 from avp_habitat.sight.bits import unpack
@@ -153,7 +152,7 @@ def test_planners_that_know_the_scene_plan_in_either(simulator, monkeypatch):
     truth = np.array([clear(place + [0, 1.5, 0], places.points) for place in places.position])
     assert (sees == truth).mean() >= 0.99
     for kind in (OraclePolicy, SurveyPolicy):
-        policy = kind(lambda: agent_views(env), beam=BeamSettings(width=30))
+        policy = kind(lambda: agent_views(env), width=30)
         (observation, _), info = env.reset(seed=1), {}
         for _ in range(12):
             observation, *_, info = env.step(int(policy.predict(observation)[0]))

@@ -76,15 +76,9 @@ def _flood(sources, other, length, distance, towards, buckets, fill):
 def reach_tables(sees, points, places, other, length, steps_per_length, ahead, near_m):
     """How far every place is from seeing every cell, and in which direction to set out.
 
-    Args:
-        sees: `(p, words)` cells that are not hidden from each place.
-        points: `(m, 3)` floor points of the cells, metres.
-        places: `(p, 3)` metres.
-        other: `(p, 8)` neighbours.
-        length: `(p, 8)` lengths of the way to them.
-        steps_per_length: forward moves per unit of `length`.
-        ahead: the direction is that of the place so many places ahead on the way.
-        near_m: cells nearer than this on the floor need a look down; places farther off are preferred.
+    Arrays are those of `ScenePlaces`: `other` its neighbours, `length` `(p, 8)` how far they are, each unit of it
+    `steps_per_length` forward moves. The direction is that of the place `ahead` places on; cells nearer than `near_m`
+    on the floor need a look down, so that places farther off are preferred.
 
     Returns:
         `(p, m)` uint8 half steps to the nearest place that sees the cell (`NEVER` when there is none), and `(p, m)`
@@ -132,19 +126,10 @@ def _further(towards, place, count):
 
 @njit(cache=True)
 def look(parent, place, pose, camera, sees, points, seen):
-    """What n candidate views add to what was seen.
+    """`(n, words)` cells that n candidate views add to what was seen, and `(n,)` how many they are.
 
-    Args:
-        parent: `(n,)` row of `seen` that each candidate continues.
-        place: `(n,)` the candidates' places.
-        pose: `(n, 4, 4)` camera_to_world, habitat axes.
-        camera: `rules.camera_numbers`.
-        sees: `(p, words)` cells that are not hidden from each place.
-        points: `(m, 3)` floor points of the cells, metres.
-        seen: `(k, words)` cells seen before.
-
-    Returns:
-        `(n, words)` the new cells, and `(n,)` how many they are.
+    Candidate i stands at place `place[i]`, continues row `parent[i]` of `seen` `(k, words)` and looks from `pose[i]`,
+    `(4, 4)` camera_to_world, habitat axes, with `rules.camera_numbers`; `sees` and `points` are those of `ScenePlaces`.
     """
     fresh, gain = np.zeros((len(parent), sees.shape[1]), np.uint64), np.zeros(len(parent), np.int64)
     for i in range(len(parent)):
@@ -163,16 +148,10 @@ def look(parent, place, pose, camera, sees, points, seen):
 def outlook(place, yaw, unseen, reach, heading, near_turn, far_turn, left, pace):
     """`(n,)` what the cells not yet seen can still bring: for each, the views left once it could be in sight.
 
-    Args:
-        place: `(n,)` numbers of places.
-        yaw: `(n,)` uint8, 256ths of a turn.
-        unseen: `(n, words)` cells that can be seen at all and were not.
-        reach: `(p, m)` of `reach_tables`.
-        heading: `(p, m)` of `reach_tables`.
-        near_turn: `(256,)` steps of turning until a cell at this difference of heading is in the image.
-        far_turn: `(256,)` steps of turning until the agent faces it.
-        left: views left after the candidate's.
-        pace: steps counted for each step of the shortest way, because one walk cannot serve all cells.
+    Candidate i, after whose view `left` are left, stands at place `place[i]`, looks to `yaw[i]` (uint8, 256ths of a
+    turn), and lacks the cells in row i of `unseen` `(n, words)`. `reach` and `heading` are those of `reach_tables`;
+    `near_turn` and `far_turn` `(256,)` are the steps of turning until a cell at that difference of heading is in the
+    image, and until the agent faces it; `pace` is `search.PACE`.
     """
     result = np.zeros(len(place), np.float64)
     for i in range(len(place)):
@@ -194,12 +173,8 @@ def outlook(place, yaw, unseen, reach, heading, near_turn, far_turn, left, pace)
 def choose(order, key, seen, width, per_key):
     """Rows of the best candidates: at most `per_key` of one key, never two of one key that have seen the same.
 
-    Args:
-        order: `(n,)` rows, the best first.
-        key: `(n,)` where a candidate stands and looks.
-        seen: `(n, words)` cells that it has seen.
-        width: largest number to keep.
-        per_key: largest number to keep of one key.
+    `order` has the rows, the best first; `key` `(n,)` says where a candidate stands and looks, `seen` `(n, words)` what
+    it has seen; `width` is the largest number to keep.
     """
     kept, count = np.empty(width, np.int64), 0
     used, states = {np.int64(0): 0}, {np.uint64(0)}

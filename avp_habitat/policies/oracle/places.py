@@ -1,6 +1,7 @@
 """What can be seen from where in a whole scene: places on its floor, with tables of floor cells."""
 
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,17 +72,11 @@ class ScenePlaces:
 
 
 def views_from(places: ScenePlaces, settings: TaskSettings, position: Float, yaw: Float, pitch: Float) -> Bits:
-    """`(n, words)` cells observed by the views of n agents; what is hidden is taken from the nearest places.
+    """`(n, words)` cells observed by the views of n agents: `(n, 3)` feet in metres, `(n,)` angles in radians.
 
-    Args:
-        places: of the scene.
-        settings: of the task.
-        position: `(n, 3)` feet, metres.
-        yaw: `(n,)` radians.
-        pitch: `(n,)` radians.
+    What is hidden is taken from the nearest places.
     """
-    nothing = np.zeros((1, len(places.wanted)), np.uint64)
-    parent = np.zeros(len(position), np.int64)
+    nothing, parent = np.zeros((1, len(places.wanted)), np.uint64), np.zeros(len(position), np.int64)
     return new_views(places, settings, parent, position, yaw, pitch, nothing)[0]
 
 
@@ -99,24 +94,14 @@ def new_views(
     return kernels.look(parent, places.nearest(position), pose, camera, places.sees, places.points, seen)
 
 
-def scene_places(simulator: Simulator, settings: TaskSettings, *, surfaces: bool = False) -> ScenePlaces:
-    """The scene's places for these settings, with or without all surfaces, prepared once per simulator object."""
-    numbers = settings.sensor_height_m, settings.max_range_m, settings.tolerance_m, settings.forward_m
-    return once_per_simulator(
-        simulator, ("places", *numbers, surfaces), lambda: make_places(simulator, settings, surfaces=surfaces)
-    )
-
-
-def make_places(
+@once_per_simulator("sensor_height_m", "max_range_m", "tolerance_m", "forward_m")
+def scene_places(
     simulator: Simulator, settings: TaskSettings, *, surfaces: bool = False, entries: int = TABLE_ENTRIES
 ) -> ScenePlaces:
     """Look from every place at every cell within range, and find the ways between the places.
 
-    Args:
-        simulator: of the scene.
-        settings: of the task: sensor height, range, tolerance, length of a move.
-        surfaces: whether points on other surfaces count like floor cells once they are seen from near.
-        entries: most pairs of a place and a cell; their spacing is the smallest multiple of a cell that keeps below.
+    With `surfaces`, points on other surfaces count like floor cells once they are seen from near. The places' spacing
+    is the smallest multiple of a cell that gives no more than `entries` pairs of a place and a cell.
     """
     area = simulator.area
     points = area.centres
@@ -132,32 +117,22 @@ def make_places(
     grid[tuple(np.argwhere(area.mask)[cells].T)] = np.arange(len(cells))
     other, length = kernels.neighbour_table(np.ascontiguousarray(grid[::stride, ::stride]), len(cells))
     spacing = stride * area.cell_m
-    unit_m, ahead = spacing / kernels.LENGTHS_PER_SPACING, max(1, round(_AHEAD_M / spacing))
-    steps = unit_m / settings.forward_m
+    steps = spacing / kernels.LENGTHS_PER_SPACING / settings.forward_m
+    ahead = max(1, round(_AHEAD_M / spacing))
     reach, heading = kernels.reach_tables(sees, points, places, other, length, steps, ahead, _NEAR_M)
-    return ScenePlaces(
-        area=area,
-        position=places,
-        points=points,
-        sees=sees,
-        wanted=np.bitwise_or.reduce(sees, axis=0),
-        reach=reach,
-        heading=heading,
-        neighbours=other,
-        lengths_m=np.asarray(length * spacing / kernels.LENGTHS_PER_SPACING, dtype=np.float64),
-        tree=KDTree(places[:, [0, 2]]),
-    )
+    lengths_m = np.asarray(length * spacing / kernels.LENGTHS_PER_SPACING, dtype=np.float64)
+    wanted, tree = np.bitwise_or.reduce(sees, axis=0), KDTree(places[:, [0, 2]])
+    return ScenePlaces(area, places, points, sees, wanted, reach, heading, other, lengths_m, tree)
 
 
 def _stride(mask: NDArray[np.bool_], most: int) -> tuple[int, NDArray[np.int64]]:
     """Spacing in cells, and the numbers of the navigable cells that are places, at most so many if it can be."""
     rows, columns = np.nonzero(mask)
-    stride = 0
-    while True:
-        stride += 1
+    for stride in count(1):
         cells = np.flatnonzero((rows % stride == 0) & (columns % stride == 0))
         if 0 < len(cells) <= max(most, 1):
-            return stride, cells
+            break
+    return stride, cells
 
 
 def _unhidden(simulator: Simulator, places: Float, points: Float, range_m: Float, settings: TaskSettings) -> Bits:

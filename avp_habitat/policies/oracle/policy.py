@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import UsageError
 from avp_habitat.policies.oracle.places import scene_places
-from avp_habitat.policies.oracle.search import BeamSettings, beam_search, start_state
-from avp_habitat.policies.oracle.tour import covering_tour
+from avp_habitat.policies.oracle.search import beam_search, covering_tour, start_state
 from avp_habitat.policies.planning import PlanningPolicy
-from avp_habitat.sight.bits import pack
 from avp_habitat.sight.rules import candidates
 from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.motion import act, sensor_poses
@@ -28,32 +26,26 @@ class Plan:
     """`(T,)` coverage C after each view (Eq. 17)."""
 
 
-def make_plan(view: AgentView, *, surfaces: bool = False, beam: BeamSettings | None = None) -> Plan:
+def make_plan(view: AgentView, *, surfaces: bool = False, width: int | None = None) -> Plan:
     """Plan the rest of an agent's episode with full knowledge of the scene.
 
-    Args:
-        view: the agent now; at the start of an episode all views are left.
-        surfaces: plan to see every surface, not the floor alone, by a beam search over action sequences; surfaces other
-            than the floor count as not yet seen. Without it, the tour of a greedy set cover is planned too, and the
-            plan with the larger mean coverage over its views is returned.
-        beam: width of the search.
+    Two plans are made, by the tour of a greedy set cover and by a beam search over action sequences, and the one with
+    the larger mean coverage over its views is returned. With `surfaces`, the search alone plans to see every surface,
+    not the floor alone; surfaces other than the floor count as not yet seen.
 
     Raises:
         UsageError: the task does not count visible cells.
     """
     settings = view.settings
     if settings.coverage_mode != "visible":
+        name = "survey" if surfaces else "oracle"
         raise UsageError(
-            f"policy {'survey' if surfaces else 'oracle'}: plans for coverage_mode 'visible', got "
-            f"{settings.coverage_mode!r}; choose another policy"
+            f"policy {name}: plans for coverage_mode 'visible', got {settings.coverage_mode!r}; choose another policy"
         )
     places = scene_places(view.simulator, settings, surfaces=surfaces)
-    seen = np.zeros(len(places.points), dtype=np.bool_)
-    seen[: len(view.observed)] = view.observed
-    start = start_state(view.position, pack(seen[None])[0], yaw=view.yaw, pitch=view.pitch)
-    views = settings.budget - view.steps
+    start, views = start_state(view, len(places.points)), settings.budget - view.steps
     found = [] if surfaces else [covering_tour(places, settings, start, views)]
-    found.append(beam_search(places, settings, start, views, beam or BeamSettings(width=300 if surfaces else 1000)))
+    found.append(beam_search(places, settings, start, views, width or (300 if surfaces else 1000)))
     plans = [Plan(actions, planned_coverage(view, actions)) for actions in found]
     return max(plans, key=lambda plan: plan.coverage.sum())
 
@@ -104,15 +96,15 @@ class OraclePolicy(PlanningPolicy):
     surfaces = False
 
     def __init__(
-        self, views: Callable[[], list[AgentView]], seed: int | None = None, *, beam: BeamSettings | None = None
+        self, views: Callable[[], list[AgentView]], seed: int | None = None, *, width: int | None = None
     ) -> None:
-        """As `PlanningPolicy`, and with the width of the search."""
+        """As `PlanningPolicy`, and with the number of states that the beam search keeps."""
         super().__init__(views, seed)
-        self.beam = beam
+        self.width = width
 
     def make_planner(self, rng: np.random.Generator) -> OraclePlanner:
         """For one episode; nothing is drawn at random."""
-        return OraclePlanner(partial(make_plan, surfaces=self.surfaces, beam=self.beam))
+        return OraclePlanner(partial(make_plan, surfaces=self.surfaces, width=self.width))
 
 
 class SurveyPolicy(OraclePolicy):
