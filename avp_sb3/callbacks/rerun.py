@@ -21,7 +21,7 @@ import rerun as rr
 from stable_baselines3.common.callbacks import BaseCallback
 
 from avp_habitat.errors import AVPError, UsageError
-from avp_habitat.files import check_new
+from avp_habitat.files import check_new, check_writable
 from avp_sb3.callbacks.base import finished_episodes, required
 from avp_sb3.rerun import APPLICATION
 from avp_sb3.rerun.episode import episode_of, log_episode, metric_path
@@ -244,11 +244,9 @@ def _curves(kept: list[_Figures]) -> Iterator[tuple[str, list[rr.TimeColumn], li
 def _recording_in(path: Path, identity: str, layout: rr.blueprint.Blueprint) -> rr.RecordingStream:
     """A recording in a file that did not exist, in a folder that is made if need be."""
     check_new(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()  # Rerun's own error for an unwritable path does not say why.
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot write the recording there: {error.strerror or error}") from None
+    # Rerun's own error for an unwritable path does not say why.
+    check_writable(path, failure=RecordingError, option="")
+    path.parent.mkdir(parents=True, exist_ok=True)
     recording = rr.RecordingStream(APPLICATION, recording_id=identity)
     recording.save(path, default_blueprint=layout)
     return recording

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from avp_habitat.errors import UsageError
@@ -51,14 +52,9 @@ def own_random_state(model: BaseAlgorithm, seed: int) -> Iterator[None]:
     """
     drawing = model.action_space.np_random.bit_generator
     before = random.getstate(), np.random.get_state(), drawing.state, model.policy.training
-    on_gpu = model.device.type == "cuda"
-    with torch.random.fork_rng([model.device] if on_gpu else []):
+    with torch.random.fork_rng([model.device] if model.device.type == "cuda" else []):
         try:
-            random.seed(seed)
-            np.random.seed(seed % 2**32)
-            torch.default_generator.manual_seed(seed)
-            if on_gpu:
-                torch.cuda.manual_seed(seed)
+            set_random_seed(seed)
             drawing.state = np.random.default_rng(seed).bit_generator.state
             yield
         finally:
