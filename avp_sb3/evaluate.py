@@ -89,17 +89,8 @@ def main(options: Evaluate) -> None:
     print(f"opening {options.scene} for {', '.join(map(described, options.policy))} …", flush=True)
     simulator = open_simulator(options.simulator, options.scene)
     # All of them before the first episode, so that the last one's fault does not cost the others' time.
-    runners = [
-        PolicyRunner(
-            policy,
-            simulator,
-            options.settings,
-            observation=options.observation,
-            stochastic=options.stochastic,
-            trusted=options.trusted,
-        )
-        for policy in options.policy
-    ]
+    how = {name: getattr(options, name) for name in ("observation", "stochastic", "trusted")}
+    runners = [PolicyRunner(policy, simulator, options.settings, **how) for policy in options.policy]
     done: dict[str, list[Episode]] = {runner.name: [] for runner in runners}
     try:
         with progress(total=len(runners) * options.episodes, desc="evaluating", unit="episode") as bar:
@@ -108,24 +99,22 @@ def main(options: Evaluate) -> None:
                 for number in range(options.episodes):
                     done[runner.name].append(runner.run(options.seed + number))
                     bar.update()
-    except KeyboardInterrupt:
-        _report(runners, done, options, out, complete=False)
-        raise
-    _report(runners, done, options, out, complete=True)
+    finally:
+        # What came before an interruption is kept.
+        _report(runners, done, options, out)
 
 
-def _report(
-    runners: Sequence[PolicyRunner], done: dict[str, list[Episode]], options: Evaluate, out: Path, *, complete: bool
-) -> None:
+def _report(runners: Sequence[PolicyRunner], done: dict[str, list[Episode]], options: Evaluate, out: Path) -> None:
     results = [runner.result(done[runner.name], options.seed) for runner in runners if done[runner.name]]
     if not results:
         return
-    env = runners[0].env
-    about = _about(env, options, complete=complete)
+    env, episodes = runners[0].env, sum(map(len, done.values()))
+    complete = episodes == len(done) * options.episodes
+    about = {"complete": complete, **_about(env, options)}
     print(f"{table(results, options.metrics)}\n\n{LEGEND}\n")
     write_report(out, results, about, options.metrics)
     if not complete:
-        print(f"interrupted after {sum(map(len, done.values()))} episodes, which are kept")
+        print(f"interrupted after {episodes} episodes, which are kept")
     print(f"report:  {out}")
     if options.no_mlflow:
         return
@@ -140,12 +129,11 @@ def _report(
     print(f"MLflow:  run {run} in experiment {experiment!r} at {store}")
 
 
-def _about(env: Any, options: Evaluate, *, complete: bool) -> dict[str, Any]:
+def _about(env: Any, options: Evaluate) -> dict[str, Any]:
     settings = env.settings.facts()
     del settings["observation"]  # Each policy has its own.
     return {
         "command": shlex.join(["python", "-m", "avp_sb3.evaluate", *sys.argv[1:]]),
-        "complete": complete,
         "scene": {"name": env.scene_name, "sha256": env.scene_digest, "navigable_cells": len(env.area.centres)},
         "simulator": {"name": env.simulator.name, "version": env.simulator.version},
         "seed": options.seed,

@@ -34,8 +34,8 @@ class PPOPreset:
         from stable_baselines3.common.utils import LinearSchedule
 
         arguments = asdict(self)
-        del arguments["n_envs"], arguments["linear"]
-        if self.linear:
+        del arguments["n_envs"]
+        if arguments.pop("linear"):
             arguments["learning_rate"] = LinearSchedule(self.learning_rate, 0.0, 1.0)
         return arguments
 

@@ -3,6 +3,7 @@
 import shlex
 import sys
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -133,7 +134,7 @@ def _model(options: Train, env: Any) -> Any:
 
 
 def _resumed_file(resume: str, folder: str) -> Path:
-    """The model's file, of which MLflow's copy comes into the folder, with its statistics beside it."""
+    """The model's file; MLflow's copy comes into the folder, with its statistics beside it."""
     if not resume.startswith(_MLFLOW):
         if not Path(resume).is_file():
             raise UsageError(f"--resume {resume}: no such model file")
@@ -154,13 +155,10 @@ def _resumed_file(resume: str, folder: str) -> Path:
     if not found.is_file():
         raise UsageError(f"--resume {resume}: expected a model file, found a folder; add /model.zip")
     if is_normalised(found):
-        beside = f"{resume.removesuffix('.zip')}_vecnormalize.pkl"
-        try:
+        # Without them `statistics_of` says what is missing.
+        with suppress(MlflowException, OSError):
+            beside = f"{resume.removesuffix('.zip')}_vecnormalize.pkl"
             download_artifacts(artifact_uri=beside, dst_path=folder, tracking_uri=address)
-        except (MlflowException, OSError):
-            raise UsageError(
-                f"--resume {resume}: trained under VecNormalize, but its statistics {beside} are not with the run"
-            ) from None
     return found
 
 
@@ -197,19 +195,17 @@ def main(options: Train) -> None:
     tracking = MLflowCallback(options.experiment, run_name=options.run_name)
     callbacks = _callbacks(options, tracking)
     begun = model.num_timesteps
-    done = False
     try:
         with tracking:
             # With reset_num_timesteps=False, SB3 counts the steps from where the model stands.
             model.learn(
                 options.steps - begun, callback=callbacks, progress_bar=True, reset_num_timesteps=options.resume is None
             )
-        done = True
     finally:
         if model.num_timesteps > begun:
             save_model(model, options.out)
             print(f"{options.out}: the policy after {model.num_timesteps} steps; MLflow run {tracking.run_id}")
-            if not done:
+            if model.num_timesteps < options.steps:
                 again = shlex.join(["python", "-m", "avp_sb3.train", *sys.argv[1:], "--resume", str(options.out)])
                 print(f"to go on:  {again}")
         env.close()

@@ -23,7 +23,7 @@ from avp_habitat.tracking import deliver
 from avp_habitat.tracking.experiments import find_run
 from avp_habitat.tracking.stores import TrackingError
 from avp_sb3 import MetricsCallback, MLflowCallback
-from avp_sb3.callbacks.run_facts import hyperparameters, run_name
+from avp_sb3.callbacks.mlflow import hyperparameters, run_name
 
 TESTS = Path(__file__).parent
 

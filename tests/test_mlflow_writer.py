@@ -83,7 +83,7 @@ def test_pictures_become_a_series_and_files_artifacts(run, tmp_path):
     colours = np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8)
     for step in (10, 20):
         logger.record("eval/room:7/map", Image(colours, "HWC"))
-        logger.record("eval/grey", Image(torch.full((8, 9), 0.5), "HW"))
+        logger.record("eval/grey", Image(np.full((8, 9), 128, dtype=np.uint8), "HW"))
         logger.dump(step)
     (tmp_path / "best.bin").write_bytes(b"first")
     logger.record("eval/best", LoggedFile(tmp_path / "best.bin", "models/best.bin"), exclude=NOT_FOR)

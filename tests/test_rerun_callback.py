@@ -215,7 +215,7 @@ def test_an_existing_file_is_refused(tmp_path):
 
 def test_an_unwritable_folder_is_named(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(RecordingError, match=r"file/a\.rrd: cannot write the recording there"):
+    with pytest.raises(RecordingError, match=r"file/a\.rrd: cannot write there"):
         ppo().learn(64, callback=RerunCallback(tmp_path / "file" / "a.rrd"))
 
 

@@ -8,8 +8,7 @@ from rrd import chunks, verify
 
 from avp_habitat import poses
 from avp_habitat.poses import Intrinsics
-from avp_sb3.rerun.environments import room_poses
-from avp_sb3.rerun.room import log_room, room_points
+from avp_sb3.rerun.room import log_room, room_points, room_poses
 
 CAMERA = Intrinsics.from_hfov(24, 16, hfov_deg=80)
 

@@ -60,7 +60,7 @@ def test_an_evaluation_opens_other_scenes_beside_the_trainings(tmp_path):
     model.learn(16, callback=evaluation)
     assert evaluation.best is not None
     assert (tmp_path / "best.zip").exists()
-    with pytest.raises(UsageError, match=r"Batched: scenes: .*got 2 scenes; add --vec-env subproc and set n_envs:2"):
+    with pytest.raises(UsageError, match=r"expected one scene, got 2: .*rl_zoo3: --vec-env subproc"):
         zoo.Batched(DummyVecEnv([lambda: AVPEnv("builtin:0", simulator="habitat", **SMALL)] * 2), scenes=ROOMS)
     version = env.simulator.version
     assert version.startswith("habitat-sim 0.")

@@ -84,7 +84,7 @@ def test_the_training_script_trains_tracks_and_saves(tmp_path):
         (("--resume", "runs:/1/model.zip"), "--resume runs:/1/model.zip: no MLflow database at sqlite:///"),
         (("--eval-every", 0), "--eval-every: expected a whole number from 1 to 1,000,000,000,000, got 0"),
         (("--gpu", 0), "--gpu: is of the simulator 'habitat', but 'raycast' was chosen"),
-        (("--workers", 0), "workers: expected 1 or a multiple of it, as there is 1 scene, got 0"),
+        (("--workers", 0), "workers: expected a multiple of the number of scenes, 1, got 0"),
     ],
 )
 def test_wrong_options_of_the_training_end_before_anything_is_made(refused, tmp_path, words, error):

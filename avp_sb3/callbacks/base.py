@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecEnv
 
 from avp_habitat.errors import AVPError
+from avp_habitat.task.settings import TaskSettings
 
 NOT_FOR = ("stdout", "log", "json", "csv", "tensorboard")
 """Formats that cannot hold a file: `logger.record(name, LoggedFile(path), exclude=NOT_FOR)`."""
@@ -38,33 +40,28 @@ class MissingInfoError(AVPError):
     """An environment that does not report what a callback reads."""
 
 
+def settings_of(env: VecEnv) -> TaskSettings | None:
+    """The task's, of the first environment; None where it has none."""
+    found = env.get_attr("settings", 0)[0] if env.has_attr("settings") else None
+    return found if isinstance(found, TaskSettings) else None
+
+
 def is_learning(model: Any) -> bool:
     """Whether `model.learn` is among the callers, which says that a training came to its own end.
 
-    rl_zoo3 calls the first callback's `on_training_end` once more in a `finally`, whatever ended the training; SB3 has
-    no hook that tells the two apart.
+    rl_zoo3 calls the first callback's `on_training_end` once more in a `finally`, whatever ended the training.
     """
     frames = (frame for frame, _ in traceback.walk_stack(None) if frame.f_code.co_name == "learn")
     return any(frame.f_locals.get("self") is model for frame in frames)
 
 
 def finished_episodes(locals_: Mapping[str, Any]) -> list[tuple[int, dict[str, Any]]]:
-    """Index of the environment, and the last `info`, of every episode that ended in this step.
-
-    Args:
-        locals_: a callback's `self.locals`.
-    """
+    """Index of the environment, and the last `info`, of every episode that ended in this step of a callback."""
     return [(int(index), locals_["infos"][index]) for index in np.flatnonzero(locals_["dones"])]
 
 
 def required(info: Mapping[str, Any], key: str, *, reader: str, inside: str = "info") -> Any:
-    """`info[key]`.
-
-    Args:
-        info: the mapping.
-        key: what must be in it.
-        reader: the callback that needs it, for the error's text.
-        inside: how the mapping is called, for the error's text.
+    """`info[key]`, which the callback `reader` needs; `inside` is how the error calls the mapping.
 
     Raises:
         MissingInfoError: the key is missing.
@@ -73,6 +70,6 @@ def required(info: Mapping[str, Any], key: str, *, reader: str, inside: str = "i
         return info[key]
     found = ", ".join(sorted(map(str, info))) or "nothing"
     raise MissingInfoError(
-        f"{reader}: expected {key!r} in {inside} at the end of an episode, found {found}; train on AVP-v0 "
-        "(gymnasium.make('avp_habitat:AVP-v0')) or another environment that reports it, and keep it in every wrapper"
+        f"{reader}: expected {key!r} in {inside} at the end of an episode, found {found}; train on AVP-v0 or another "
+        "environment that reports it, and keep it in every wrapper"
     )

@@ -7,6 +7,7 @@ import warnings
 import zipfile
 from collections.abc import Iterable
 from datetime import datetime
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ from avp_habitat.policies.saved_model import statistics_names
 from avp_sb3.evaluation.policy import figures_of
 
 WHEN = "DATE-TIME"
-"""In a file's name: replaced by when the training started."""
 _TRAINING, _BEST = "avp_training_id", "avp_best"
 
 
@@ -30,17 +30,11 @@ class BestModel:
     """Compares scores, and keeps the model with the best one.
 
     A model carries an identity of its training in `avp_training_id`, and the score in `avp_best`; both are in its
-    `.zip`, so that a resumed training goes on with its own file and never touches another's. The statistics of a
-    training with `VecNormalize` lie beside it as `NAME_vecnormalize.pkl`.
+    `.zip`, so that a resumed training goes on with its own file and never touches another's.
     """
 
     def __init__(self, path: str | Path | None, score: str) -> None:
-        """Describe what is kept.
-
-        Args:
-            path: of the file; `DATE-TIME` in it is replaced by when the training started; None to compare only.
-            score: what is compared.
-        """
+        """Compare a score; keep the model in a file, in whose name `DATE-TIME` becomes when the training started."""
         self.path: Path | None = None
         self.value: float | None = None
         self._wanted = None if path is None else Path(path)
@@ -49,9 +43,7 @@ class BestModel:
     def start(self, model: BaseAlgorithm, metrics: Iterable[Any] = ()) -> None:
         """Find the file's name, and go on from the file that is there when it is this training's own.
 
-        Args:
-            model: that trains.
-            metrics: of the user, as `TaskSettings.metrics`; the score may be one of them.
+        The score may be one of the user's metrics, as `TaskSettings.metrics` has them.
 
         Raises:
             UsageError: there is no such score, or the file is another training's, or its best by another score.
@@ -68,7 +60,7 @@ class BestModel:
         if self._wanted is None:
             return
         self.path = path = self._path()
-        files = [path] if model.get_vec_normalize_env() is None else [path, statistics_of(path)]
+        files = [path] if model.get_vec_normalize_env() is None else [path, statistics_names(path)[0]]
         if found := [file for file in files if file.is_symlink() or file.exists()]:
             self.value = self._own_value(path, found[0], getattr(model, _TRAINING))
         check_writable(path, failure=BestModelError, option="best_model")
@@ -97,46 +89,29 @@ class BestModel:
 
     def _path(self) -> Path:
         assert self._wanted is not None
-        wanted = self._wanted if self._wanted.suffix == ".zip" else self._wanted.with_name(f"{self._wanted.name}.zip")
+        wanted = self._wanted if self._wanted.suffix == ".zip" else Path(f"{self._wanted}.zip")
         if WHEN not in wanted.name:
             return wanted
-        path = wanted.with_name(wanted.name.replace(WHEN, f"{datetime.now():%Y%m%d-%H%M%S}"))
-        stem, number = path.stem, 1
-        while path.exists() or path.is_symlink():
-            number += 1
-            path = path.with_stem(f"{stem}-{number}")
-        return path
+        named = wanted.with_name(wanted.name.replace(WHEN, f"{datetime.now():%Y%m%d-%H%M%S}"))
+        names = (named.with_stem(f"{named.stem}-{number}") for number in count(2))
+        return next(path for path in chain([named], names) if not path.exists())
 
     def _own_value(self, path: Path, found: Path, training: str) -> float:
         held = _held(path)
         if held.get(_TRAINING) != training:
-            raise UsageError(
-                f"best_model {found}: exists already and is not of this training; choose another name, remove it, or "
-                "resume the training that made it"
-            )
+            raise UsageError(f"best_model {found}: exists already and is not of this training; choose another name")
         best = held.get(_BEST) or {}
         if best.get("score") != self._score:
-            raise UsageError(
-                f"best_model {path}: holds this training's best by {best.get('score')!r}, asked for is "
-                f"{self._score!r}; choose another name"
-            )
+            told = f"holds this training's best by {best.get('score')!r}, asked for is {self._score!r}"
+            raise UsageError(f"best_model {path}: {told}; choose another name")
         return float(best["value"])
 
 
-def statistics_of(path: Path) -> Path:
-    """Beside a model that trains with `VecNormalize`: the statistics without which it is worth nothing."""
-    return statistics_names(path)[0]
-
-
 def save_model(model: BaseAlgorithm, path: Path) -> None:
-    """Write a model, and beside it the statistics of a training with `VecNormalize`; each file is whole or not there.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a model, and beside it the statistics of a training with `VecNormalize`; each is whole or not there."""
     normalised = model.get_vec_normalize_env()
     if normalised is not None:
-        with atomic_file(statistics_of(path)) as file:
+        with atomic_file(statistics_names(path)[0]) as file:
             normalised.save(os.fspath(file))
     with atomic_file(path) as file:
         model.save(file)

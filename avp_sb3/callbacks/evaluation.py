@@ -10,17 +10,18 @@ from stable_baselines3.common.logger import Image, Logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from avp_habitat.errors import UsageError
+from avp_habitat.policies.saved_model import statistics_names
 from avp_habitat.simulators.registry import SimulatorChoice
 from avp_habitat.task.settings import TaskSettings
-from avp_sb3.callbacks.base import NOT_FOR, LoggedFile, MissingInfoError, is_learning, record
-from avp_sb3.callbacks.best_model import WHEN, BestModel, statistics_of
+from avp_sb3.callbacks.base import NOT_FOR, LoggedFile, MissingInfoError, is_learning, record, settings_of
+from avp_sb3.callbacks.best_model import WHEN, BestModel
 from avp_sb3.evaluation.batch import READER, check_fit, means, own_random_state, run_batch, scenes_of
 from avp_sb3.evaluation.picture import evaluation_picture
 from avp_sb3.evaluation.policy import Episode
-from avp_sb3.vec_env.batched import AVPVecEnv
+from avp_sb3.vec_env.batched import AVPVecEnv, Scenes, scenes_given
 from avp_sb3.vec_env.subproc import AVPSubprocVecEnv
 
-DEFAULT_SCENES = ("builtin:7",)
+DEFAULT_SCENES: Scenes = ("builtin:7",)
 DEFAULT_EVERY, DEFAULT_EPISODES = 150_000, 10
 """About 0.7 % of a training with Table 4's values and tables; whoever evaluates more often pays in proportion."""
 _NO_PICTURES = ("stdout", "log", "json", "csv")
@@ -40,13 +41,12 @@ class EvaluationCallback(BaseCallback):
     It logs `eval/FIGURE`, the means of the figures of `avp_sb3.evaluate` and of `return` over all scenes and episodes,
     with several scenes also `eval/SCENE/FIGURE`, a picture `eval/SCENE/trajectory` (the first start's path, and
     coverage by view), and `eval/best_SCORE` with the model itself when it is better than before. The last evaluation is
-    that of the finished model; an interrupted training has none. The training's environment and random numbers are not
-    touched: with or without this callback the same weights come out.
+    that of the finished model. With or without this callback the same weights come out.
     """
 
     def __init__(
         self,
-        scenes: str | Path | Sequence[str | Path] | None = None,
+        scenes: Scenes | None = None,
         *,
         eval_env: VecEnv | None = None,
         every: int = DEFAULT_EVERY,
@@ -81,7 +81,7 @@ class EvaluationCallback(BaseCallback):
                 best for figures of which less is better (views, collisions, redundant_share), else the greatest.
             best_model: file of the best model; `DATE-TIME` in its name becomes when the training started; None keeps
                 none. A file that exists is refused unless the training that made it goes on.
-            settings: of the task; those of the training's environment when omitted, also whether views are looked up.
+            settings: of the task; those of the training's environment when omitted.
             simulator: that opens the scenes; with `habitat` each of them is in a process of its own.
             gpu: as of `AVPVecEnv`.
             navmesh: as of `AVPVecEnv`.
@@ -95,14 +95,16 @@ class EvaluationCallback(BaseCallback):
         for name, value in (("every", every), ("episodes", episodes)):
             if value < 1:
                 raise UsageError(f"{READER} {name}: expected at least 1, got {value}")
-        self._scenes = _scenes(scenes, eval_env, settings)
+        for name, value in (("scenes", scenes), ("settings", settings)):
+            if eval_env is not None and value is not None:
+                raise UsageError(f"{READER}: expected {name} or eval_env, got both")
+        self._scenes = DEFAULT_SCENES if scenes is None else scenes
         self._given, self._env = eval_env, eval_env
         self._every, self._episodes, self._seed = every, episodes, seed
         self._deterministic, self._at_start, self._score = deterministic, at_start, score
         self._settings = settings
         self._choice = SimulatorChoice(simulator, gpu=gpu, navmesh=Path(navmesh) if navmesh else None, up=up)
         self._best = BestModel(best_model, score)
-        self._due = 0
         self._evaluated_at: int | None = None
 
     @property
@@ -120,10 +122,10 @@ class EvaluationCallback(BaseCallback):
         with own_random_state(self.model, self._seed):
             self._env = self._open() if self._given is None else self._given
         check_fit(self.model, self.training_env, self._env)
-        settings = self._env.get_attr("settings", 0)[0] if self._env.has_attr("settings") else None
-        self._best.start(self.model, settings.metrics if isinstance(settings, TaskSettings) else ())
+        settings = settings_of(self._env)
+        self._best.start(self.model, () if settings is None else settings.metrics)
         self._evaluated_at = None
-        self._plan_next()
+        self._intervals = self.num_timesteps // self._every
         _move_to_front(self, self.locals.get("callback"))
 
     def _on_rollout_start(self) -> None:
@@ -133,9 +135,9 @@ class EvaluationCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         # The last evaluation comes after the last update; one within the last rollout would be the same but worse.
-        if self._due <= self.num_timesteps < self.model._total_timesteps:
+        is_due = self.num_timesteps // self._every > self._intervals
+        if is_due and self.num_timesteps < self.model._total_timesteps:
             self._evaluate()
-            self._plan_next()
         return True
 
     def _on_training_end(self) -> None:
@@ -150,32 +152,23 @@ class EvaluationCallback(BaseCallback):
         if self._given is None and self._env is not None:
             self._env.close()
 
-    def _plan_next(self) -> None:
-        self._due = (self.num_timesteps // self._every + 1) * self._every
-
     def _open(self) -> VecEnv:
-        settings = self._settings
+        settings = self._settings or settings_of(self.training_env)
         if settings is None:
-            env = self.training_env
-            settings = env.get_attr("settings", 0)[0] if env.has_attr("settings") else None
-            if not isinstance(settings, TaskSettings):
-                raise UsageError(
-                    f"{READER}: the training's environment has no settings of AVP-v0 to evaluate with; expected "
-                    "settings, or an eval_env of its own kind"
-                )
-            # Only rays can be looked up.
-            settings = replace(settings, lookup=settings.lookup and self._choice.single_rays)
+            raise UsageError(f"{READER}: the training has no settings of AVP-v0; expected settings, or an eval_env")
+        # Only rays can be looked up.
+        settings = replace(settings, lookup=settings.lookup and self._choice.single_rays)
         vec_env = AVPSubprocVecEnv if self._choice.one_per_process else AVPVecEnv
-        agents = self._episodes * len(self._scenes)
-        return vec_env(self._scenes, agents=agents, settings=settings, **vars(self._choice))
+        scenes = scenes_given(self._scenes, self._choice)
+        return vec_env(scenes, agents=self._episodes * len(scenes), settings=settings, **vars(self._choice))
 
     def _evaluate(self) -> None:
         assert self._env is not None
         with own_random_state(self.model, self._seed):
             found = run_batch(self.model, self._env, self._episodes, seed=self._seed, deterministic=self._deterministic)
         self._evaluated_at = self.num_timesteps
-        # A logger of its own with the same outputs: SB3's EvalCallback would dump what the training has recorded so
-        # far, half of a rollout's figures and the last update's losses.
+        self._intervals = self.num_timesteps // self._every
+        # A logger of its own with the same outputs: the training's would dump half of a rollout's figures.
         logger = Logger(None, self.logger.output_formats)
         self._record(logger, found)
         logger.record("time/total_timesteps", self.num_timesteps, exclude=("tensorboard", "mlflow"))
@@ -190,10 +183,8 @@ class EvaluationCallback(BaseCallback):
                 record(logger, f"eval/{scene}/{name}", value)
             logger.record(f"eval/{scene}/trajectory", self._picture(scene, episodes), exclude=_NO_PICTURES)
         if self._score not in figures:
-            raise MissingInfoError(
-                f"{READER} score {self._score!r}: needs 'coverage' in every info and the attribute 'settings' of "
-                f"AVP-v0; this environment gives {', '.join(sorted(figures))}"
-            )
+            found_figures = ", ".join(sorted(figures))
+            raise MissingInfoError(f"{READER} score {self._score!r}: this environment gives only {found_figures}")
         if self._best.offer(self.model, figures[self._score]):
             self._record_best(logger, figures[self._score])
 
@@ -206,39 +197,18 @@ class EvaluationCallback(BaseCallback):
 
     def _record_best(self, logger: Logger, value: float) -> None:
         logger.record(f"eval/best_{self._score}", value)
-        path = self._best.path
-        if path is None:
+        if (path := self._best.path) is None:
             return
         logger.record("eval/best_model", LoggedFile(path, "best_model.zip"), exclude=NOT_FOR)
         if self.model.get_vec_normalize_env() is not None:
-            file = LoggedFile(statistics_of(path), "best_model_vecnormalize.pkl")
+            file = LoggedFile(statistics_names(path)[0], "best_model_vecnormalize.pkl")
             logger.record("eval/best_model_vecnormalize", file, exclude=NOT_FOR)
         if self.verbose > 1:
             print(f"{path}: the best model so far, {self._score} {value:.4g} after {self.num_timesteps} steps")
 
 
-def _scenes(
-    scenes: str | Path | Sequence[str | Path] | None, env: VecEnv | None, settings: TaskSettings | None
-) -> list[str]:
-    if env is not None:
-        for name, value in (("scenes", scenes), ("settings", settings)):
-            if value is not None:
-                raise UsageError(f"{READER}: expected {name} or eval_env, got both")
-        return []
-    given = DEFAULT_SCENES if scenes is None else [scenes] if isinstance(scenes, (str, Path)) else scenes
-    found = list(map(str, given))
-    if not found:
-        raise UsageError(f"{READER} scenes: expected at least one, got none")
-    if repeated := {scene for scene in found if found.count(scene) > 1}:
-        raise UsageError(f"{READER} scenes: expected each once, got {', '.join(sorted(repeated))} again")
-    return found
-
-
 def _move_to_front(callback: BaseCallback, whole: Any) -> bool:
-    """Let a callback of `whole` come first: trackers close at the end of the training, and its last figures come then.
-
-    The lists that the caller made stay as they are.
-    """
+    """Let a callback of `whole` come first: trackers close at the training's end, and its last figures come then."""
     for part in whole.callbacks if isinstance(whole, CallbackList) else ():
         if _move_to_front(callback, part):
             whole.callbacks = [part, *(other for other in whole.callbacks if other is not part)]

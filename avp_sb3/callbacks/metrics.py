@@ -10,10 +10,10 @@ from tqdm import tqdm
 
 from avp_habitat.command import progress
 from avp_habitat.metrics import coverage_per_view
-from avp_sb3.callbacks.base import MissingInfoError, finished_episodes, record, required
+from avp_sb3.callbacks.base import finished_episodes, record, required
 from avp_sb3.evaluation.policy import RETURN
 
-_READER, _INSIDE = "MetricsCallback", "info['avp_episode']"
+_READER = "MetricsCallback"
 
 
 class EpisodeWindow:
@@ -28,16 +28,13 @@ class EpisodeWindow:
         self._added = 0
 
     def add(self, episode: Mapping[str, Any]) -> None:
-        """Take in an episode, in place of the oldest one when the window is full.
-
-        Args:
-            episode: `info["avp_episode"]`: coverage, views and any other figures.
+        """Take in an episode's `info["avp_episode"]`, in place of the oldest one when the window is full.
 
         Raises:
-            MissingInfoError: coverage or views is missing, or a figure is no number.
+            MissingInfoError: coverage or views is missing.
         """
         for key in ("coverage", "views"):
-            required(episode, key, reader=_READER, inside=_INSIDE)
+            required(episode, key, reader=_READER, inside="info['avp_episode']")
         if new := {key: _name(key) for key in episode if key not in self._names}:
             self._names |= new
             self._rows = np.hstack([self._rows, np.tile([_number({}, key) for key in new], (len(self._rows), 1))])
@@ -54,11 +51,8 @@ class EpisodeWindow:
         known = ~np.isnan(rows)
         counts = known.sum(axis=0)
         mean = np.where(known, rows, 0.0).sum(axis=0) / np.maximum(counts, 1)
-        found = {
-            name: value
-            for name, value, count in zip(self._names.values(), mean.tolist(), counts.tolist(), strict=True)
-            if count
-        }
+        means = dict(zip(self._names.values(), mean.tolist(), strict=True))
+        found = {name: value for (name, value), count in zip(means.items(), counts, strict=True) if count}
         if "avp/coverage" in found and "avp/views" in found:
             found["avp/cpv"] = coverage_per_view(np.array([found["avp/coverage"]]), np.array([found["avp/views"]]))
         return found
@@ -73,11 +67,7 @@ def _name(key: str) -> str:
 
 def _number(episode: Mapping[str, Any], key: str) -> float:
     # A part of the reward that an episode does not have gave it nothing; another figure is not known.
-    value = episode.get(key, 0.0 if key.startswith(RETURN) else np.nan)
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise MissingInfoError(f"{_READER}: expected a number as {_INSIDE}[{key!r}], got {value!r}") from None
+    return float(episode.get(key, 0.0 if key.startswith(RETURN) else np.nan))
 
 
 class MetricsCallback(BaseCallback):
@@ -89,12 +79,7 @@ class MetricsCallback(BaseCallback):
     """
 
     def __init__(self, window: int = 100, verbose: int = 1) -> None:
-        """Set the window.
-
-        Args:
-            window: episodes to average over.
-            verbose: 0 shows no progress.
-        """
+        """Average over the last `window` episodes; with `verbose=0` no progress is shown."""
         super().__init__(verbose)
         self._bar: tqdm | None = None
         self._size = window

@@ -1,6 +1,7 @@
 """A training of Stable-Baselines3 as an MLflow run."""
 
 import atexit
+import inspect
 import json
 import logging
 import sys
@@ -8,15 +9,16 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 from io import BytesIO
-from types import TracebackType
 from typing import Any
 
 import mlflow
 import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Figure, Image, KVWriter
+from stable_baselines3.common.vec_env import VecEnv
 
 from avp_habitat.errors import UsageError
 from avp_habitat.provenance import flat
@@ -27,13 +29,13 @@ from avp_habitat.tracking.deliver import recover_in_background
 from avp_habitat.tracking.names import CONTINUED_TAG, KIND_TAG, RESUMED_TAG
 from avp_habitat.tracking.run import NewRun, Status, TrackedRun, continue_run, join_run, may_continue, start_run
 from avp_habitat.tracking.stores import DEFAULT_ADDRESS, about_run, shown
-from avp_sb3.callbacks.base import LoggedFile, finished_episodes, is_learning
-from avp_sb3.callbacks.run_facts import hyperparameters, run_name, scene_tags, task_settings
+from avp_sb3.callbacks.base import LoggedFile, finished_episodes, is_learning, settings_of
 
 FORMAT = "mlflow"
 """The name by which `logger.record(..., exclude="mlflow")` keeps a value away from MLflow."""
 MODEL_FILE, STATISTICS_FILE, PARAMS_FILE = "model.zip", "model_vecnormalize.pkl", "params.json"
 TRAJECTORY_FILE = "trajectory.png"
+_NOT_HYPERPARAMETERS = {"self", "env", "policy", "verbose", "tensorboard_log", "_init_setup_model"}
 _log = logging.getLogger(__name__)
 
 
@@ -75,21 +77,15 @@ class MLflowWriter(KVWriter):
 
 
 def _pixels(value: Image | Figure) -> NDArray[np.uint8] | None:
-    """A picture as `(h, w, 3)` bytes; None for an arrangement of axes other than HWC, CHW and HW."""
+    """A picture as `(h, w, 3)` bytes; None for one that is not bytes in the order HWC or HW."""
     if isinstance(value, Figure):
         buffer = BytesIO()
         value.figure.savefig(buffer, format="png")
         return np.asarray(PIL.Image.open(buffer).convert("RGB"))
     pixels = np.asarray(value.image)
-    order = {"HWC": (0, 1, 2), "CHW": (1, 2, 0), "HW": (0, 1)}.get(value.dataformats.upper())
-    if order is None or pixels.ndim != len(order):
+    if value.dataformats not in ("HWC", "HW") or pixels.dtype != np.uint8:
         return None
-    pixels = pixels.transpose(order)
-    # As TensorBoard reads them: floats within [0, 1], whole numbers within [0, 255].
-    if np.issubdtype(pixels.dtype, np.floating):
-        pixels = np.clip(255 * pixels, 0, 255).round()
-    pixels = pixels.astype(np.uint8).reshape(*pixels.shape[:2], -1)[..., :3]
-    return np.repeat(pixels, 3, axis=-1) if pixels.shape[-1] == 1 else pixels
+    return np.asarray(PIL.Image.fromarray(pixels).convert("RGB"))
 
 
 class MLflowCallback(BaseCallback):
@@ -99,12 +95,9 @@ class MLflowCallback(BaseCallback):
 
         model.learn(300_000, callback=[MetricsCallback(), MLflowCallback()])
 
-    and in rl_zoo3's hyper-parameters `callback: avp_sb3.MLflowCallback`. Nothing waits for MLflow: what is logged is on
-    disk at once (`runs/mlflow-spool`) and with MLflow some seconds later. When the server is gone it is kept, and sent
-    when the server is back or by `python -m avp_habitat.tracking.deliver`.
-
-    `learn(reset_num_timesteps=False)` with a model whose run was interrupted goes on in the same run. The run of a
-    training that was killed is closed as KILLED at the next start.
+    and in rl_zoo3's hyper-parameters `callback: avp_sb3.MLflowCallback`. Nothing waits for MLflow, and what a server
+    misses is sent when it is back (docs/tracking.md). `learn(reset_num_timesteps=False)` with a model whose run was
+    interrupted goes on in the same run.
 
     SB3 tells its callbacks nothing when `learn()` is left by an exception or Ctrl-C. To have the run closed at that
     moment and with the right status (FAILED, or KILLED for an interruption), make it a context:
@@ -113,7 +106,7 @@ class MLflowCallback(BaseCallback):
             model.learn(300_000, callback=mlflow_callback)
 
     Without it an unfinished run is closed when the host cleans up (rl_zoo3), at the next `learn()` with this callback,
-    by `close()`, or else when Python exits: FAILED if an exception ended the program, KILLED otherwise.
+    by `close()`, or else when Python exits.
     """
 
     def __init__(
@@ -133,11 +126,10 @@ class MLflowCallback(BaseCallback):
         """Describe the run; nothing is contacted before the training starts.
 
         Args:
-            experiment: MLflow experiment, made when it does not exist; when omitted, what MLflow's functions or
-                variables say, else `avp`. Not used within an active run.
+            experiment: made when it does not exist; when omitted, what MLflow's functions or variables say, else `avp`.
+                Not used within an active run.
             run_name: when omitted, algorithm, reward, scene and seed.
-            tracking_uri: where runs are kept; when omitted, what MLflow's functions or variables say, else
-                `sqlite:///mlflow.db` in the current folder.
+            tracking_uri: when omitted, what MLflow's functions or variables say, else `sqlite:///mlflow.db`.
             run_id: go on with this run; when omitted, with the model's own if it was interrupted.
             log_model: keep the model (with the statistics of `VecNormalize`) as artifact `model.zip`, on the way and at
                 the end unless the training failed.
@@ -172,9 +164,7 @@ class MLflowCallback(BaseCallback):
         """Promise that the run is closed when the block is left."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         """Close a run that is still open with the status that the exception deserves."""
         self.close(_status_of(error))
 
@@ -210,17 +200,12 @@ class MLflowCallback(BaseCallback):
         self._run = run = self._open_run(earlier)
         self._remember(run)
         atexit.register(self._close_at_exit)
-        try:
-            self._log_facts(run, earlier)
-        except BaseException as error:
-            self.close(_status_of(error))
-            raise
+        self._log_facts(run, earlier)
         self._writer = MLflowWriter(run)
         self.logger.output_formats.append(self._writer)
         self._saved_at = time.monotonic()
-        recovery = recover_in_background()
         # The usual case, a store on this machine, is a matter of milliseconds; a slow server is not waited for.
-        recovery.join(0.5)
+        recover_in_background().join(0.5)
         if self.verbose > 1:
             print(f"MLflow:   run {run.run_id} at {shown(run.address)}", flush=True)
 
@@ -242,16 +227,14 @@ class MLflowCallback(BaseCallback):
 
     def _open_run(self, earlier: str | None) -> TrackedRun:
         """The active run, the one to go on with, or a new one; `earlier` trained the model so far."""
-        configured = mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else DEFAULT_ADDRESS
         active = mlflow.active_run()
-        if active is not None:
-            if self._tracking_uri not in (None, mlflow.get_tracking_uri()):
-                raise UsageError(
-                    f"tracking_uri {self._tracking_uri}: the active MLflow run {active.info.run_id} is kept at "
-                    f"{mlflow.get_tracking_uri()}; end that run or leave tracking_uri out"
-                )
-            return join_run(mlflow.get_tracking_uri(), active.info.run_id)
+        configured = mlflow.get_tracking_uri() if active or mlflow.is_tracking_uri_set() else DEFAULT_ADDRESS
         address = self._tracking_uri or configured
+        if active is not None:
+            if address != configured:
+                kept = f"the active MLflow run {active.info.run_id} is kept at {configured}"
+                raise UsageError(f"tracking_uri {address}: {kept}; end that run or leave tracking_uri out")
+            return join_run(address, active.info.run_id)
         if self._wanted_run is not None:
             return continue_run(address, self._wanted_run, offline=self._offline)
         if earlier is not None and self.model.num_timesteps > 0 and may_continue(address, earlier):
@@ -266,8 +249,9 @@ class MLflowCallback(BaseCallback):
 
     def _log_facts(self, run: TrackedRun, earlier: str | None) -> None:
         env = self.training_env
-        params = hyperparameters(self.model) | task_settings(env) | flat(self._params)
-        tags = {KIND_TAG: "training"} | scene_tags(env)
+        params = hyperparameters(self.model) | _task_facts(env) | flat(self._params)
+        scenes = {"avp.scene": _each_once(env, "scene_name"), "avp.scene_digest": _each_once(env, "scene_digest")}
+        tags = {KIND_TAG: "training"} | {tag: ", ".join(values) for tag, values in scenes.items() if values}
         steps = self.model.num_timesteps
         if earlier is not None and earlier != run.run_id:
             tags[CONTINUED_TAG] = earlier
@@ -298,3 +282,60 @@ class MLflowCallback(BaseCallback):
 def _status_of(error: BaseException | None) -> Status:
     interrupted = error is None or isinstance(error, (KeyboardInterrupt, SystemExit))
     return "KILLED" if interrupted else "FAILED"
+
+
+def hyperparameters(model: BaseAlgorithm) -> dict[str, Any]:
+    """The arguments of the algorithm's constructor with the values in use, flat, plus `algo`, `policy`, `n_envs`.
+
+    A constant schedule is its number; a changing one reads `start -> end`.
+    """
+    facts: dict[str, Any] = {
+        "algo": type(model).__name__,
+        "policy": model.policy_class.__name__,
+        "n_envs": model.n_envs,
+        "total_timesteps": model._total_timesteps,
+    }
+    for name in inspect.signature(type(model).__init__).parameters:
+        if name not in _NOT_HYPERPARAMETERS and hasattr(model, name):
+            facts[name] = _plain(getattr(model, name))
+    return flat(facts)
+
+
+def _task_facts(env: VecEnv) -> dict[str, Any]:
+    """`env.*`: the settings of the first environment, flat, and its gymnasium id."""
+    settings = settings_of(env)
+    facts = {} if settings is None else settings.facts()
+    spec = env.get_attr("spec", 0)[0] if env.has_attr("spec") else None
+    if spec is not None:
+        facts["id"] = spec.id
+    return flat({"env": facts})
+
+
+def run_name(model: BaseAlgorithm, env: VecEnv) -> str:
+    """Algorithm, reward, scene and seed, as far as there are any: `ppo proposed builtin:0 seed 0`.
+
+    MLflow would draw a name at random, the same one after each training with the same seed.
+    """
+    task, scenes = _task_facts(env), _each_once(env, "scene_name")
+    words = [type(model).__name__.lower(), task.get("env.reward"), scenes[0] if scenes else task.get("env.id")]
+    words += [f"and {len(scenes) - 1} more"] if len(scenes) > 1 else []
+    words += [] if model.seed is None else [f"seed {model.seed}"]
+    return " ".join(str(word) for word in words if word is not None)
+
+
+def _each_once(env: VecEnv, attribute: str) -> list[str]:
+    """The values of an attribute over the environments; none where they have no such attribute."""
+    return list(dict.fromkeys(map(str, env.get_attr(attribute)))) if env.has_attr(attribute) else []
+
+
+def _plain(value: Any) -> Any:
+    """A value whose text says what it is, without memory addresses."""
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, type) or not callable(value):
+        return getattr(value, "__name__", value)
+    try:
+        start, end = (float(value(progress)) for progress in (1.0, 0.0))  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return getattr(value, "__name__", type(value).__name__)
+    return start if start == end else f"{start:g} -> {end:g}"

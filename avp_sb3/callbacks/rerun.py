@@ -8,6 +8,7 @@ import socket
 import sys
 import sysconfig
 import time
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from datetime import datetime
 from numbers import Real
@@ -20,13 +21,12 @@ import rerun as rr
 from stable_baselines3.common.callbacks import BaseCallback
 
 from avp_habitat.errors import AVPError, UsageError
-from avp_habitat.files import check_new
+from avp_habitat.files import check_new, check_writable
 from avp_sb3.callbacks.base import finished_episodes, required
 from avp_sb3.rerun import APPLICATION
-from avp_sb3.rerun.environments import RecordedEnvironments
 from avp_sb3.rerun.episode import episode_of, log_episode, metric_path
 from avp_sb3.rerun.layout import eye_above, training_blueprint
-from avp_sb3.rerun.room import log_room
+from avp_sb3.rerun.room import RecordedEnvironments, log_room
 
 _FLUSH_S = 5.0
 _LEAST_FREE = 100_000_000
@@ -49,8 +49,7 @@ class RerunCallback(BaseCallback):
     floor, without `capture` no pictures, without both no room, without `info["avp_episode"]` no curves.
 
     An episode of 80 steps with 6 pictures of 240x180 takes about 0.2 MB, a scene 0.5 to 1 MB once, 1,000 episodes'
-    figures 0.4 MB (1 MB at five episodes a second: every 10 s some are sent). `max_bytes` bounds the whole file,
-    `max_share` the time. When the disk is nearly full or a viewer goes away, it says so once and the training goes on.
+    figures 0.4 MB. When the disk is nearly full or a viewer goes away, it says so once and the training goes on.
     """
 
     def __init__(
@@ -78,7 +77,7 @@ class RerunCallback(BaseCallback):
             pictures: RGB and depth pictures per episode at most, spread over its steps; 0 for none.
             width: of the pictures, pixels.
             height: of the pictures, pixels.
-            max_bytes: nothing is added that would make the file larger than about this.
+            max_bytes: of the whole file, about.
             max_share: recording may take this share of the training's time; 1 records every k-th episode.
             verbose: 1 prints at the end where the recording is, 2 also at the start; 0 prints nothing.
 
@@ -86,10 +85,10 @@ class RerunCallback(BaseCallback):
             UsageError: an option that cannot be right.
         """
         super().__init__(verbose)
-        least = {"every": 1, "pictures": 0, "width": 1, "height": 1, "max_bytes": 1}
-        for name, value in zip(least, (every, pictures, width, height, max_bytes), strict=True):
-            if value < least[name]:
-                raise UsageError(f"RerunCallback {name}: expected at least {least[name]}, got {value}")
+        given = {"every": every, "pictures": pictures, "width": width, "height": height, "max_bytes": max_bytes}
+        for name, value in given.items():
+            if value < (least := 0 if name == "pictures" else 1):
+                raise UsageError(f"RerunCallback {name}: expected at least {least}, got {value}")
         if not 0 < max_share <= 1:
             raise UsageError(f"RerunCallback max_share: expected a number within (0, 1], got {max_share}")
         if not (live in (None, "viewer", "web") or (live.startswith("rerun+http://") and live.endswith("/proxy"))):
@@ -105,7 +104,7 @@ class RerunCallback(BaseCallback):
     def close(self) -> None:
         """Finish the file, as the end of `learn()` does, and stop the server of `live="web"`."""
         atexit.unregister(self.close)
-        self._finish()
+        self._on_training_end()
         while self._recordings:
             self._recordings.popitem()[1].disconnect()
 
@@ -131,9 +130,8 @@ class RerunCallback(BaseCallback):
             print(f"Rerun:    {self.path}", flush=True)
         if self._live is not None:
             self._recordings[self._live] = _live_recording(self._live, identity, layout)
-        lost = {"area": "floor and room", "capture": "pictures and room"}
         for name in self._environments.missing:
-            self._say(f"the environment has no {name!r}: recording without {lost[name]}")
+            self._say(f"the environment has no {name!r}: recording without what that shows, and without the room")
 
     def _on_step(self) -> bool:
         for index, info in finished_episodes(self.locals):
@@ -151,9 +149,6 @@ class RerunCallback(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        self._finish()
-
-    def _finish(self) -> None:
         """Send what is kept and end the file; a viewer stays."""
         if not self._recordings:
             return
@@ -164,18 +159,16 @@ class RerunCallback(BaseCallback):
                 print(f"Rerun:    rerun {shlex.quote(str(self.path))}", flush=True)
 
     def _is_due(self) -> bool:
-        if self._episodes < self._due:
-            return False
         in_time = self._spent <= self._max_share * (time.monotonic() - self._started)
-        return in_time and self._has_room(self._largest)
+        return self._episodes >= self._due and in_time and self._has_room(self._largest)
 
     def _record(self, index: int, trajectory: Any, times: Mapping[str, int]) -> None:
         began, size = time.monotonic(), self._file_size
         width, height = self._size
         camera = self._environments.camera(index, width=width, height=height)
         views = self._environments.pictures(index, trajectory, camera, at_most=self._pictures)
-        episode = episode_of(trajectory, self._environments.area(index), camera, views)
-        root = self._roots.get(self._environments.scene(index), "")
+        episode = episode_of(trajectory, self._environments.get("area", index), camera, views)
+        root = self._roots.get(self._environments.get("scene_name", index, ""), "")
         is_new = root not in self._shown
         room = self._environments.room(index) if is_new else None
         if room is not None and not self._has_room(sum(array.nbytes for array in room)):
@@ -238,23 +231,22 @@ class RerunCallback(BaseCallback):
 
 def _curves(kept: list[_Figures]) -> Iterator[tuple[str, list[rr.TimeColumn], list[float]]]:
     """Entity, times and values of each figure, apart for the episodes that have a `step` and those that have none."""
-    for lines in dict.fromkeys(tuple(times) for times, _ in kept):
-        rows = [(times, figures) for times, figures in kept if tuple(times) == lines]
-        values = [item for _, figures in rows for item in figures.items()]
-        for name in dict.fromkeys(name for name, value in values if isinstance(value, Real)):
-            having = [(times, figures[name]) for times, figures in rows if name in figures]
-            columns = [rr.TimeColumn(line, sequence=[times[line] for times, _ in having]) for line in lines]
-            yield metric_path("", name), columns, [value for _, value in having]
+    curves = defaultdict(list)
+    for times, figures in kept:
+        for name, value in figures.items():
+            if isinstance(value, Real):
+                curves[name, tuple(times)].append((times, value))
+    for (name, lines), points in curves.items():
+        columns = [rr.TimeColumn(line, sequence=[times[line] for times, _ in points]) for line in lines]
+        yield metric_path("", name), columns, [value for _, value in points]
 
 
 def _recording_in(path: Path, identity: str, layout: rr.blueprint.Blueprint) -> rr.RecordingStream:
     """A recording in a file that did not exist, in a folder that is made if need be."""
     check_new(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()  # Rerun's own error for an unwritable path does not say why.
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot write the recording there: {error.strerror or error}") from None
+    # Rerun's own error for an unwritable path does not say why.
+    check_writable(path, failure=RecordingError, option="")
+    path.parent.mkdir(parents=True, exist_ok=True)
     recording = rr.RecordingStream(APPLICATION, recording_id=identity)
     recording.save(path, default_blueprint=layout)
     return recording

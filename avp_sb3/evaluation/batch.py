@@ -1,6 +1,7 @@
 """Episodes of a model that still trains, run side by side in a vector environment of their own."""
 
 import random
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
@@ -8,15 +9,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from avp_habitat.errors import UsageError
 from avp_habitat.metrics import coverage_per_view
-from avp_habitat.task.settings import TaskSettings
 from avp_habitat.tracking.names import safe_name
-from avp_sb3.callbacks.base import required
+from avp_sb3.callbacks.base import required, settings_of
 from avp_sb3.evaluation.policy import Episode, episode_of
 
 READER = "EvaluationCallback"
@@ -24,12 +24,7 @@ READER = "EvaluationCallback"
 
 
 def check_fit(model: BaseAlgorithm, training: VecEnv, env: VecEnv) -> None:
-    """Refuse an evaluation's environment that the policy cannot act in.
-
-    Args:
-        model: that trains.
-        training: its environment.
-        env: of the evaluation.
+    """Refuse an evaluation's environment `env` that the policy cannot act in.
 
     Raises:
         UsageError: the spaces differ, only the evaluation is normalised, or it is the training's own environment.
@@ -53,19 +48,13 @@ def check_fit(model: BaseAlgorithm, training: VecEnv, env: VecEnv) -> None:
 def own_random_state(model: BaseAlgorithm, seed: int) -> Iterator[None]:
     """Within the block, all generators that `model.predict` may use start from `seed`; after it they are as before.
 
-    These are Python's, NumPy's and torch's global ones and that of the model's action space. The policy's training mode
-    is given back, too.
+    The policy's training mode is given back, too.
     """
     drawing = model.action_space.np_random.bit_generator
     before = random.getstate(), np.random.get_state(), drawing.state, model.policy.training
-    on_gpu = model.device.type == "cuda"
-    with torch.random.fork_rng([model.device] if on_gpu else []):
+    with torch.random.fork_rng([model.device] if model.device.type == "cuda" else []):
         try:
-            random.seed(seed)
-            np.random.seed(seed % 2**32)
-            torch.default_generator.manual_seed(seed)
-            if on_gpu:
-                torch.cuda.manual_seed(seed)
+            set_random_seed(seed)
             drawing.state = np.random.default_rng(seed).bit_generator.state
             yield
         finally:
@@ -84,35 +73,27 @@ def scenes_of(env: VecEnv) -> dict[str, list[int]]:
         return {"env": list(range(env.num_envs))}
     names = env.get_attr("scene_name")
     digests = env.get_attr("scene_digest") if env.has_attr("scene_digest") else names
-    labels: dict[tuple[str, str], str] = {}
-    found: dict[str, list[int]] = {}
+    agents = defaultdict(list)
     for agent, scene in enumerate(zip(names, digests, strict=True)):
-        if scene not in labels:
-            label = safe_name(str(scene[0]).replace("/", "_")).replace(" ", "_")
-            numbered = [label, *(f"{label}-{number}" for number in range(2, len(found) + 2))]
-            labels[scene] = next(name for name in numbered if name not in found)
-        found.setdefault(labels[scene], []).append(agent)
+        agents[scene].append(agent)
+    found: dict[str, list[int]] = {}
+    for (name, _), own in agents.items():
+        label = safe_name(str(name).replace("/", "_")).replace(" ", "_")
+        numbered = [label, *(f"{label}-{number}" for number in range(2, len(found) + 2))]
+        found[next(each for each in numbered if each not in found)] = own
     return found
 
 
 def run_batch(
     model: BaseAlgorithm, env: VecEnv, episodes: int, *, seed: int, deterministic: bool
 ) -> dict[str, list[Episode]]:
-    """Run episodes; all environments are stepped by one call, and those that have done theirs are not counted further.
+    """So many episodes in each scene (`scenes_of`), spread over its environments, of which the i-th has `seed + i`.
 
-    Args:
-        model: whose policy acts; it is asked once for each step. Where the model trains with `VecNormalize`, it sees
-            observations normalised with the training's statistics.
-        env: seeded and reset here.
-        episodes: in each scene, as evenly spread over its environments as can be.
-        seed: the i-th environment of each scene starts from `seed + i`.
-        deterministic: False to sample the actions.
+    All environments are stepped by one call, and those that have done theirs are not counted further. A model that
+    trains with `VecNormalize` sees observations normalised with the training's statistics.
 
     Raises:
         MissingInfoError: the environment does not report what is needed.
-
-    Returns:
-        The episodes by scene (`scenes_of`), sorted by environment.
     """
     scenes = scenes_of(env)
     wanted = np.zeros(env.num_envs, dtype=np.int64)
@@ -121,11 +102,11 @@ def run_batch(
         for place, agent in enumerate(agents):
             wanted[agent] = (episodes + len(agents) - 1 - place) // len(agents)
             seeds[agent] = seed + place
-    settings = env.get_attr("settings", 0)[0] if env.has_attr("settings") else None
-    budget = settings.budget if isinstance(settings, TaskSettings) else None
+    settings = settings_of(env)
+    budget = None if settings is None else settings.budget
     done: dict[int, list[Episode]] = {agent: [] for agent in range(env.num_envs)}
     coverage: list[list[float]] = [[] for _ in done]
-    returned = np.zeros(env.num_envs)
+    returned, ours = np.zeros(env.num_envs), unwrap_vec_normalize(env)
     with _normalised(model, env) as normalise:
         env.seed(seed)
         env.unwrapped._seeds = [*seeds]  # Other starts than seed, seed + 1, … over all scenes.
@@ -134,7 +115,7 @@ def run_batch(
             actions, state = model.predict(observation, state, starts, deterministic=deterministic)  # type: ignore[arg-type]
             observation, rewards, starts, infos = env.step(actions)
             observation = normalise(observation)
-            returned += _original(env, rewards)
+            returned += rewards if ours is None else ours.get_original_reward()
             for agent in np.flatnonzero(wanted):
                 if "coverage" in infos[agent]:
                     coverage[agent].append(float(infos[agent]["coverage"]))
@@ -178,8 +159,3 @@ def _normalised(model: BaseAlgorithm, env: VecEnv) -> Iterator[Callable[[Any], A
         yield lambda observation: observation
     finally:
         ours.training = before
-
-
-def _original(env: VecEnv, rewards: NDArray) -> NDArray:
-    normalised = unwrap_vec_normalize(env)
-    return rewards if normalised is None else normalised.get_original_reward()

@@ -10,9 +10,8 @@ from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.rollout.drawing import beside, draw_trajectory
 from avp_habitat.task.trajectory import Trajectory
 
-_SIZE = (420, 320)
+_WIDTH, _HEIGHT, _MAP_PX = 420, 320, 420
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 14, 30, 36
-_MAP_PX = 420
 _BACKGROUND, _INK, _GRID = (255, 255, 255), (40, 40, 44), (222, 224, 228)
 _EPISODE, _MEAN = (170, 195, 215), (178, 34, 52)
 _HEIGHTS = 5
@@ -21,16 +20,7 @@ _HEIGHTS = 5
 def evaluation_picture(
     curves: Sequence[NDArray[np.floating]], area: NavigableArea | None = None, trajectory: Trajectory | None = None
 ) -> NDArray[np.uint8]:
-    """Draw an evaluation.
-
-    Args:
-        curves: of each of at least one episode, `(v,)` coverage after 1 … v views, within [0, 1].
-        area: of the scene; the map is left out without it.
-        trajectory: of the episode on the map; the map is left out without it.
-
-    Returns:
-        `(h, w, 3)` uint8.
-    """
+    """`(h, w, 3)` of at least one episode, `(v,)` coverage after 1 … v views each; with a map if both are given."""
     curve = draw_curves(curves)
     if area is None or trajectory is None:
         return curve
@@ -38,20 +28,13 @@ def evaluation_picture(
 
 
 def draw_curves(curves: Sequence[NDArray[np.floating]]) -> NDArray[np.uint8]:
-    """Coverage by view: each episode thin, the mean over the episodes that have so many views thick.
-
-    Args:
-        curves: `(v,)` each, within [0, 1]; at least one.
-
-    Returns:
-        `(h, w, 3)` uint8.
-    """
+    """Coverage by view: each episode thin, the mean over the episodes that have so many views thick."""
     longest = max(len(curve) for curve in curves)
     stacked = np.full((len(curves), longest), np.nan)
     for row, curve in zip(stacked, curves, strict=True):
         row[: len(curve)] = curve
     mean = np.nanmean(stacked, axis=0)
-    canvas = Image.new("RGB", _SIZE, _BACKGROUND)
+    canvas = Image.new("RGB", (_WIDTH, _HEIGHT), _BACKGROUND)
     draw = ImageDraw.Draw(canvas)
     _draw_axes(draw, longest)
     for curve in curves:
@@ -85,7 +68,4 @@ def _draw_axes(draw: ImageDraw.ImageDraw, longest: int) -> None:
 
 def _pixel(x: float, y: float) -> tuple[float, float]:
     """Pixel of a place within the axes, both within [0, 1] from the lower left."""
-    return (
-        _LEFT + x * (_SIZE[0] - _LEFT - _RIGHT),
-        _TOP + (1 - y) * (_SIZE[1] - _TOP - _BOTTOM),
-    )
+    return _LEFT + x * (_WIDTH - _LEFT - _RIGHT), _TOP + (1 - y) * (_HEIGHT - _TOP - _BOTTOM)

@@ -28,11 +28,7 @@ RETURN = "return_"
 
 
 def figures_of(metrics: Iterable[Any] = ()) -> dict[str, Figure]:
-    """All figures that an evaluation may have, by name, in the order in which tables show them.
-
-    Args:
-        metrics: of the user, as `TaskSettings.metrics`.
-    """
+    """All figures that an evaluation with `TaskSettings.metrics` may have, by name, in the order of the tables."""
     known = figures(tuple(metrics))
     return {"coverage": known["coverage"]} | {figure.name: figure for figure in _OWN} | known
 
@@ -51,12 +47,10 @@ class Episode:
 
 
 def episode_of(coverage: Sequence[float], info: Mapping[str, Any], budget: int | None) -> Episode:
-    """A finished episode.
+    """A finished episode, of which `info` is that of the last step.
 
-    Args:
-        coverage: `(v,)` after each view, within [0, 1]; empty where it is not known.
-        info: of the last step.
-        budget: T, at least v; None where it is not known. The figures of the whole curve are then left out.
+    `coverage` is `(v,)` after each view, empty where it is not known. Without it, or without the budget T, the figures
+    of the whole curve are left out.
     """
     found = {name: float(value) for name, value in info["avp_episode"].items() if not name.startswith(RETURN)}
     if "redundant_views" in found:
@@ -69,15 +63,7 @@ def episode_of(coverage: Sequence[float], info: Mapping[str, Any], budget: int |
 
 
 def held_curve(values: Sequence[float], budget: int) -> NDArray[np.float64]:
-    """A figure after 1 … T views, of an episode that may have stopped earlier and then holds its last value.
-
-    Args:
-        values: `(v,)` after each view, 1 ≤ v ≤ T.
-        budget: T.
-
-    Returns:
-        `(T,)`.
-    """
+    """`(T,)` values after 1 … T views, of an episode that may have stopped after v views and then holds the last."""
     return np.pad(np.asarray(values, dtype=np.float64), (0, budget - len(values)), mode="edge")
 
 
@@ -112,15 +98,7 @@ class PolicyRunner:
         stochastic: bool = False,
         trusted: bool = False,
     ) -> None:
-        """Open the policy.
-
-        Args:
-            policy: a baseline's name, or a model saved by Stable-Baselines3 (`.zip`).
-            simulator: an open one.
-            settings: of the task; visibility is always computed, never looked up.
-            observation: kind of observation; what the model was trained on when omitted.
-            stochastic: sample a model's actions instead of taking the likeliest.
-            trusted: open a model's file also where that may run code which the file holds.
+        """Open a policy, by a baseline's name or a model's file, as `evaluate_policy` does.
 
         Raises:
             UsageError: an unknown name.
@@ -174,12 +152,13 @@ def evaluate_policy(
         scene: as `avp_habitat.scenes.location.locate` takes it.
         episodes: n, at least 1.
         seed: of the first episode.
-        settings: of the task; the design's defaults when omitted. Visibility is always computed, never looked up.
-        simulator: the simulator's name.
-        gpu: as of `SimulatorChoice`.
-        navmesh: as of `SimulatorChoice`.
-        up: as of `SimulatorChoice`.
-        **options: `observation`, `stochastic` and `trusted` of `PolicyRunner`.
+        settings: of the task; the defaults when omitted. Visibility is computed, never looked up.
+        simulator: as of `SimulatorChoice`, like the next three.
+        gpu: its CUDA device.
+        navmesh: file of the scene's NavMesh.
+        up: axis of a mesh file that points up.
+        **options: `observation` (what the model was trained on when omitted), `stochastic` (sample a model's actions
+            instead of taking the likeliest), `trusted` (open a model's file also where that may run code in it).
 
     Raises:
         AVPError: as `make_simulator` and `PolicyRunner`.

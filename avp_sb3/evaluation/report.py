@@ -31,9 +31,7 @@ class ReportError(AVPError):
 def table(results: Sequence[PolicyResult], metrics: Iterable[Any] = ()) -> str:
     """Figures by policy as a Markdown table: mean ± half the 95 % confidence interval; no ± for one episode.
 
-    Args:
-        results: of at least one policy.
-        metrics: of the user, as `TaskSettings.metrics`, that say how their figures are shown.
+    The user's metrics, as of `TaskSettings.metrics`, say how their figures are shown.
     """
     head = ["figure", *(result.policy for result in results)]
     return tables.table(head, [[name, *row] for name, row in cells(results, metrics).items()])
@@ -71,11 +69,7 @@ def write_report(
 ) -> Path:
     """Write the folder; it appears only when it is whole.
 
-    Args:
-        folder: must not exist.
-        results: of at least one policy.
-        about: what was evaluated (command, scene, settings, …), as JSON; machine, commit and versions are added.
-        metrics: as of `table`.
+    `about` says what was evaluated (command, scene, settings, …), as JSON; machine, commit and versions are added.
 
     Raises:
         UsageError: the folder exists.
@@ -101,14 +95,7 @@ def write_report(
 
 
 def read_report(folder: str | Path) -> list[PolicyResult]:
-    """The results of a report, equal to those that were written.
-
-    Args:
-        folder: of the report.
-
-    Raises:
-        ReportError: its JSON is missing, unreadable or of another format.
-    """
+    """The results of a report, equal to those that were written; `ReportError` if there are none."""
     path = Path(folder) / JSON_FILE
     try:
         value = json.loads(path.read_text(encoding="utf-8"))

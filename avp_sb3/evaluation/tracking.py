@@ -47,24 +47,14 @@ def track_evaluation(
 
     The upper run holds the table of the policies and the plot of their curves. Each policy's run holds `eval/FIGURE`
     (the mean), `eval/FIGURE_ci95` (half of the interval), `eval/cpv`, its picture and, by view, `eval/curve` with
-    `eval/curve_ci95`. The run that trained a policy is its tag `avp.policy_run`, because a run of MLflow has one
-    parent only.
-
-    Args:
-        results: of the policies.
-        about: what was evaluated, as `avp_sb3.evaluate` writes it; becomes parameters. Unless it is `complete`, the
-            runs are marked as interrupted.
-        folder: of the report; its files become artifacts of the upper run.
-        experiment: MLflow experiment, made when it does not exist; as `experiments.chosen_experiment` says when None.
-        pictures: `(h, w, 3)` by policy, for those that have one.
-        metrics: as of `report.table`.
+    `eval/curve_ci95`. What was evaluated (`about`, as `avp_sb3.evaluate` writes it) becomes parameters; unless it is
+    `complete`, the runs are marked as interrupted. The files in the report's folder become artifacts.
 
     Raises:
         ReportError: MLflow failed; the report is on disk.
 
     Returns:
-        The upper run's id, the experiment's name, and the address of the store without a password: what is
-        configured, else `sqlite:///mlflow.db`.
+        The upper run's id, the experiment's name, and the address of the store without a password.
     """
     address = mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else DEFAULT_ADDRESS
     try:
@@ -97,6 +87,7 @@ def _log(
     names = [name if short[name := Path(each.policy).name] == 1 else each.policy for each in results]
     for result, name in zip(results, names, strict=True):
         own = {"mlflow.parentRunId": parent, "avp.policy": name, COLOUR_TAG: run_colour(name)}
+        # A run of MLflow has one parent only.
         own |= {"avp.policy_run": result.training_run} if result.training_run else {}
         run = client.create_run(experiment, run_name=name, tags=tags | own).info.run_id
         # Few: the page writes all of a run's above its picture; the upper run has the others, which all policies share.
@@ -124,13 +115,10 @@ def _params(values: Mapping[str, Any]) -> list[Param]:
 
 def _metrics(result: PolicyResult) -> list[Metric]:
     now = int(time.time() * 1000)
-    metrics = [
-        Metric("eval/episodes", float(len(result.seeds)), now, 0),
-        Metric("eval/cpv", cpv(result), now, 0),
-    ]
+    figures = {"eval/episodes": float(len(result.seeds)), "eval/cpv": cpv(result)}
     for name, values in summary(result).items():
-        pair = {f"eval/{name}": values["mean"], f"eval/{name}_ci95": values["half_width"]}
-        metrics += [Metric(safe_name(key), value, now, 0) for key, value in pair.items() if value is not None]
+        figures |= {f"eval/{name}": values["mean"], f"eval/{name}_ci95": values["half_width"]}
+    metrics = [Metric(safe_name(name), value, now, 0) for name, value in figures.items() if value is not None]
     for name, values in zip(("eval/curve", "eval/curve_ci95"), mean_and_half_width(result.curve), strict=True):
         known = [(view, float(value)) for view, value in enumerate(values, start=1) if np.isfinite(value)]
         metrics += [Metric(name, value, now, view) for view, value in known]

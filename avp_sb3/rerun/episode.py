@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from avp_habitat.navigation.area import NavigableArea
     from avp_habitat.task.trajectory import Trajectory
 
-Time = int | np.timedelta64 | np.datetime64
-"""A number in a sequence, a duration, or a moment."""
 _UNSEEN_COLOUR, _SEEN_COLOUR = 0xAEB4C0FF, 0x35B779FF
 _PATH_COLOUR, _VIEW_COLOUR, _AGENT_COLOUR = (178, 34, 52), (228, 120, 51, 120), (40, 40, 44)
 _PLOT_COLOURS = [0x35B779FF, 0x8C7AE6FF, 0x95A5A6FF, 0xE15759FF, 0x4E79A7FF]
@@ -97,19 +95,14 @@ def log_episode(
     root: str,
     episode: RecordedEpisode,
     *,
-    times: Mapping[str, Time],
+    times: Mapping[str, int],
     first_step: int = 0,
     with_scene: bool = True,
 ) -> None:
-    """Add an episode to a recording.
+    """Add an episode to a recording, below the entity path `root`.
 
-    Args:
-        recording: where to.
-        root: entity path above `world` and `plots`.
-        episode: what happened.
-        times: the values that further time lines have throughout, such as `episode` and `env_step`.
-        first_step: value of the time line `step` at the episode's first step.
-        with_scene: also add what holds at all times (axes, cells, camera, looks); once per root is enough.
+    `times` are the numbers that further time lines have throughout; on the time line `step` it begins at `first_step`.
+    `with_scene` adds what holds at all times (axes, cells, camera, looks); once per root is enough.
     """
     steps = len(episode.camera_to_world)
     if not steps:
@@ -117,7 +110,7 @@ def log_episode(
     if with_scene:
         _log_scene(recording, root, episode)
     world = f"{root}/world"
-    start, columns = {**times, "step": first_step}, time_columns(range(first_step, first_step + steps), times)
+    start, columns = {**times, "step": first_step}, _time_columns(range(first_step, first_step + steps), times)
     lifted = np.asarray(episode.path) + np.array([0, _PATH_LIFT_M, 0])
     log_at(recording, f"{world}/path", rr.LineStrips3D([lifted], colors=[_PATH_COLOUR], radii=[0.015]), start)
     views = rr.LineStrips3D(_pyramids(episode), colors=[_VIEW_COLOUR], radii=[0.003])
@@ -128,30 +121,25 @@ def log_episode(
         recording.send_columns(_plot_path(root, name), columns, scalars)
     if len(episode.cells):
         changes, colours = _floor_changes(episode)
-        at = time_columns([first_step + step for step in changes], times)
+        at = _time_columns([first_step + step for step in changes], times)
         recording.send_columns(f"{world}/floor", at, colours)
     if episode.views:
-        at = time_columns([first_step + step for step in sorted(episode.views)], times)
+        at = _time_columns([first_step + step for step in sorted(episode.views)], times)
         _send_views(recording, f"{world}/camera", episode, at)
 
 
-def log_at(recording: rr.RecordingStream, path: str, value: Any, times: Mapping[str, Time]) -> None:
+def log_at(recording: rr.RecordingStream, path: str, value: Any, times: Mapping[str, int]) -> None:
     """Add a value at one place on several time lines."""
     for name, time in times.items():
-        recording.set_time(name, **_by_kind(time, time))
+        recording.set_time(name, sequence=time)
     recording.log(path, value)
     recording.reset_time()
 
 
-def time_columns(steps: Sequence[int], times: Mapping[str, Time]) -> list[rr.TimeColumn]:
+def _time_columns(steps: Sequence[int], times: Mapping[str, int]) -> list[rr.TimeColumn]:
     """The time line `step`, and others that have the same value at all of these steps."""
-    columns = [rr.TimeColumn(name, **_by_kind(time, np.full(len(steps), time))) for name, time in times.items()]
-    return [rr.TimeColumn("step", sequence=list(steps)), *columns]
-
-
-def _by_kind(time: Time, value: Any) -> dict[str, Any]:
-    """The argument by which Rerun takes a time of this kind."""
-    return {{"m": "duration", "M": "timestamp"}.get(np.asarray(time).dtype.kind, "sequence"): value}
+    lines = {"step": steps} | {name: [time] * len(steps) for name, time in times.items()}
+    return [rr.TimeColumn(name, sequence=values) for name, values in lines.items()]
 
 
 def metric_path(root: str, name: str) -> str:

@@ -10,26 +10,19 @@ import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from avp_sb3.rerun import APPLICATION
-
-if TYPE_CHECKING:
-    from avp_sb3.rerun.episode import Time
 
 INCOMPATIBLE = 66
 """Rerun's exit code of an importer that does not know a path."""
 _NAME, _DEPRECATED_PREFIX = "rerun-importer-avp", "rerun-loader-"
 _META, _MARK, _HEAD_BYTES = "rollout.json", b"avp-rollout", 65_536
-_AUTOMATIC = ("log_time", "log_tick")  # Rerun gives every recording these by itself.
 
 
 def main() -> int:
-    """Run the program with the process's arguments.
+    """0: the recording was written to the standard output, or the same viewer's call for the folder writes it.
 
-    Returns:
-        0 when the recording was written to the standard output (or is written by the same viewer's call for the
-        folder), 66 when the path is no rollout, 1 when it is a damaged one, 2 for a usage error.
+    66: the path is no rollout, 1: it is a damaged one, 2: a usage error.
     """
     options = _parse(sys.argv[1:])
     asked_as = os.path.basename(sys.argv[0])
@@ -78,7 +71,7 @@ def _is_shown_with_its_folder(path: Path, application_id: str | None) -> bool:
 
 
 def _application_id(path: Path) -> str:
-    """The name that a viewer makes of a path."""
+    """As a viewer makes it of a path."""
     return path.stem.replace(".", "_")
 
 
@@ -94,31 +87,13 @@ def _answer(folders: Sequence[Path], options: argparse.Namespace) -> None:
     application = options.application_id or APPLICATION
     recording = rr.RecordingStream(application, recording_id=identity, send_properties=is_alone)
     rollouts = [read_rollout(folder) for folder in folders]
-    log_rollouts(recording, rollouts, prefix=prefix, times=_times(options), with_layout=is_alone)
+    log_rollouts(recording, rollouts, prefix=prefix, with_layout=is_alone)
     sys.stdout.buffer.write(recording.binary_stream().read() or b"")
     sys.stdout.buffer.flush()
 
 
-def _times(options: argparse.Namespace) -> "dict[str, Time]":
-    """The time lines that an application wants the rollouts to have, each with its one value."""
-    import numpy as np
-
-    moments = dict(options.sequence)
-    times: list[tuple[str, Time]] = [*options.time_sequence]
-    for name, value in options.time_duration_nanos:
-        # Rerun 0.41 sends moments as durations; only the older flag beside them tells.
-        times.append((name, np.datetime64(value, "ns") if name in moments else np.timedelta64(value, "ns")))
-    times += [(name, np.datetime64(value, "ns")) for name, value in options.time_timestamp_nanos]
-    return {name: time for name, time in times if name not in _AUTOMATIC}
-
-
-def _named_number(text: str) -> tuple[str, int]:
-    name, _, number = text.rpartition("=")
-    return name, int(number)
-
-
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
-    """The arguments; flags that later viewers may add are tolerated."""
+    """The arguments; other flags are tolerated: a program's own time lines, and what later viewers may add."""
     parser = argparse.ArgumentParser(
         prog=_NAME,
         allow_abbrev=False,
@@ -130,7 +105,4 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--recording-id", help="recording to add to")
     parser.add_argument("--opened-recording-id", help="recording on show")
     parser.add_argument("--entity-path-prefix", default="", help="entity path above all that is added")
-    pairs = {"type": _named_number, "action": "append", "default": [], "metavar": "NAME=NUMBER"}
-    for flag in ("--time_sequence", "--time_duration_nanos", "--time_timestamp_nanos", "--sequence"):
-        parser.add_argument(flag, help="a further time line with the value that it has throughout", **pairs)
     return parser.parse_known_args(argv)[0]

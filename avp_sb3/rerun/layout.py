@@ -16,11 +16,7 @@ _EYE_DIRECTION = np.array([0.2, 1.0, 0.45])
 
 
 def eye_above(points: NDArray[np.floating]) -> rrb.EyeControls3D:
-    """An eye that sees all of a scene from above, at a slant.
-
-    Args:
-        points: `(n, 3)` of the scene, metres, world frame; at least one.
-    """
+    """An eye that sees all of a scene, given at least one of its `(n, 3)` points, from above at a slant."""
     low, high = np.min(points, axis=0), np.max(points, axis=0)
     target = (low + high) / 2
     position = target + _EYE_DIRECTION * (1.5 + max(high - low))
@@ -30,8 +26,7 @@ def eye_above(points: NDArray[np.floating]) -> rrb.EyeControls3D:
 def training_blueprint(eyes: Mapping[str, rrb.EyeControls3D | None]) -> rrb.Blueprint:
     """The layout of every scene, in tabs when there are several, with the figures of all episodes.
 
-    Args:
-        eyes: by the scene's entity path, from where it is seen first; Rerun's choice when None.
+    `eyes` says by the scene's entity path from where it is seen first; Rerun's choice when None.
     """
     parts = []
     for root, eye in eyes.items():
@@ -42,12 +37,7 @@ def training_blueprint(eyes: Mapping[str, rrb.EyeControls3D | None]) -> rrb.Blue
 
 
 def rollout_blueprint(roots: Mapping[str, str], *, with_map: bool) -> rrb.Blueprint:
-    """Tabs: all rollouts side by side where there are several, each by itself, and what each came from.
-
-    Args:
-        roots: the name of each rollout by its entity path.
-        with_map: whether they have maps.
-    """
+    """Tabs: all rollouts (names by entity path) side by side if several, each by itself, and what each came from."""
     tabs = [_episode(root, name, _step_plots(root), with_map=with_map) for root, name in roots.items()]
     if len(roots) > 1:
         tabs.insert(0, _side_by_side(roots))
@@ -64,10 +54,8 @@ def _episode(
     root: str, name: str, plots: rrb.Container, *, with_map: bool = False, eye: rrb.EyeControls3D | None = None
 ) -> rrb.Container:
     """The scene, beside it the camera, the map of a rollout and the plots."""
-    pictures = [rrb.Spatial2DView(origin=f"{root}/world/camera/rgb", name="RGB")]
-    pictures.append(rrb.Spatial2DView(origin=f"{root}/world/camera/depth", name="depth"))
-    if with_map:
-        pictures.append(rrb.Spatial2DView(origin=f"{root}/map", name="map"))
+    origins = {"RGB": "world/camera/rgb", "depth": "world/camera/depth"} | ({"map": "map"} if with_map else {})
+    pictures = [rrb.Spatial2DView(origin=f"{root}/{origin}", name=title) for title, origin in origins.items()]
     right = rrb.Vertical(rrb.Horizontal(*pictures), plots, row_shares=[2, 5])
     return rrb.Horizontal(_scene(root, name, eye), right, column_shares=[3, 2], name=name)
 

@@ -3,6 +3,7 @@
 import csv
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,16 +20,7 @@ from avp_habitat.rollout import images
 from avp_habitat.rollout.format import Rollout, View, read_rollout
 from avp_habitat.task.settings import ACTION_NAMES
 from avp_sb3.rerun import APPLICATION
-from avp_sb3.rerun.episode import (
-    EncodedView,
-    RecordedEpisode,
-    Time,
-    encode_view,
-    log_at,
-    log_episode,
-    metric_path,
-    spread_indices,
-)
+from avp_sb3.rerun.episode import RecordedEpisode, encode_view, log_at, log_episode, metric_path, spread_indices
 from avp_sb3.rerun.layout import rollout_blueprint
 from avp_sb3.rerun.room import Cloud, log_room, room_points
 
@@ -52,12 +44,7 @@ class RolloutContents:
 
 
 def read_contents(rollout: Rollout, *, pictures: int = _PICTURES) -> RolloutContents:
-    """Read the tables and pictures of a rollout.
-
-    Args:
-        rollout: as read by `avp_habitat.rollout.format.read_rollout`.
-        pictures: so many views at most are shown with pictures, spread over the rollout. Larger ones than 640 pixels
-            are subsampled.
+    """Read the tables of a rollout, and the pictures (subsampled to 640 pixels) of some views, spread over it.
 
     Raises:
         RolloutError: a file is missing or unreadable, or `steps.csv` is not one row of finite numbers per frame.
@@ -69,7 +56,7 @@ def read_contents(rollout: Rollout, *, pictures: int = _PICTURES) -> RolloutCont
     focal_and_centre = {name: getattr(rollout.intrinsics, name) / stride for name in ("fx", "fy", "cx", "cy")}
     camera = Intrinsics(width=width // stride, height=height // stride, **focal_and_centre)
     chosen = spread_indices(len(rollout.frames), pictures)
-    views: dict[int, EncodedView] = {}
+    views = {}
 
     def frames() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.floating]]]:
         for step in chosen:
@@ -87,11 +74,7 @@ def read_contents(rollout: Rollout, *, pictures: int = _PICTURES) -> RolloutCont
 
 
 def read_steps(path: Path, frames: int) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
-    """Read a `steps.csv`.
-
-    Args:
-        path: of the file.
-        frames: how many rows it must have.
+    """Read a `steps.csv`, which must have `frames` rows.
 
     Returns:
         `(t,)` figures of the steps, named as those of a training's episodes, and `(t, 3)` where the agent stood after
@@ -102,11 +85,6 @@ def read_steps(path: Path, frames: int) -> tuple[dict[str, NDArray[np.float64]],
             action that no agent has or something else that is no finite number.
     """
     columns = _read_columns(path, frames)
-    if unknown := sorted(set(columns.get("action", [])) - set(ACTION_NAMES)):
-        expected = ", ".join(ACTION_NAMES)
-        raise RolloutError(f"{path}: expected actions out of {expected}, found {', '.join(map(repr, unknown))}")
-    if "action" in columns:
-        columns["action"] = [str(ACTION_NAMES.index(word)) for word in columns["action"]]
     names = {"action": "action", "coverage": "coverage", "reward/sum": "reward"}
     names |= {f"reward/{name.removeprefix('reward_')}": name for name in columns if name.startswith("reward_")}
     plots = {plot: _numbers(path, columns, name) for plot, name in names.items()}
@@ -117,8 +95,6 @@ def _read_columns(path: Path, frames: int) -> dict[str, list[str]]:
     try:
         with path.open(newline="", encoding="utf-8") as file:
             names, *rows = list(csv.reader(file)) or [[]]
-    except FileNotFoundError:
-        raise RolloutError(f"{path}: expected a table of steps, found no such file") from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise RolloutError(f"{path}: expected a table of steps, could not read it: {error}") from None
     for number, row in enumerate(rows, start=1):
@@ -132,13 +108,14 @@ def _read_columns(path: Path, frames: int) -> dict[str, list[str]]:
 def _numbers(path: Path, columns: Mapping[str, list[str]], name: str) -> NDArray[np.float64]:
     if name not in columns:
         raise RolloutError(f"{path}: expected a column {name!r}, found {', '.join(columns) or 'none'}")
-    try:
-        values = np.array([float(word) for word in columns[name]])
-    except ValueError as error:
-        raise RolloutError(f"{path}: expected numbers in column {name!r}: {error}") from None
-    for row in np.flatnonzero(~np.isfinite(values))[:1]:
-        found = f"{columns[name][row]} in row {row + 1}"
-        raise RolloutError(f"{path}: expected finite numbers in column {name!r}, found {found}")
+    is_action = name == "action"
+    expected = f"actions out of {', '.join(ACTION_NAMES)}" if is_action else "finite numbers"
+    values = np.full(len(columns[name]), np.nan)
+    for row, word in enumerate(columns[name]):
+        with suppress(ValueError):
+            values[row] = ACTION_NAMES.index(word) if is_action else float(word)
+        if not np.isfinite(values[row]):
+            raise RolloutError(f"{path}: expected {expected} in column {name!r}, found {word!r} in row {row + 1}")
     return values
 
 
@@ -152,7 +129,7 @@ def _read_view(view: View, camera: Intrinsics, stride: int) -> tuple[NDArray[np.
 
 
 def _about(rollout: Rollout) -> str:
-    """The figures as a table, and all else in `rollout.json` that says where the rollout comes from."""
+    """The figures as a table, and what `rollout.json` says of where the rollout comes from."""
     facts = {name: value for name, value in rollout.meta.items() if name not in ("metrics", "pose_convention")}
     lines = [f"# {rollout.folder.resolve().name}", "", "| metric | value |", "|---|---|"]
     lines += [f"| {name} | {value:.6g} |" for name, value in rollout.meta.get("metrics", {}).items()]
@@ -164,22 +141,14 @@ def log_rollouts(
     rollouts: Sequence[Rollout],
     *,
     prefix: str = "",
-    times: Mapping[str, Time] | None = None,
     always_named: bool = False,
     with_layout: bool = True,
     progress: bool = False,
 ) -> None:
-    """Add rollouts to a recording, after all of them have been read.
+    """Add rollouts to a recording, after all of them have been read; `with_layout` also gives it its name and layout.
 
-    Args:
-        recording: where to.
-        rollouts: as read by `avp_habitat.rollout.format.read_rollout`. Several lie under their folders' names, sharing
-            at most 400 pictures; one has at most 100.
-        prefix: entity path above them.
-        times: further time lines, each with the one value that it has for all of the rollouts.
-        always_named: one rollout lies under its folder's name too.
-        with_layout: give the recording its name and layout.
-        progress: show how many have been read.
+    Below the entity path `prefix` several rollouts (or one that is `always_named`) lie under their folders' names,
+    sharing at most 400 pictures; one has at most 100.
 
     Raises:
         RolloutError: a rollout is damaged; nothing has been added.
@@ -201,33 +170,27 @@ def log_rollouts(
         recording.send_blueprint(layout, make_active=True, make_default=True)
         recording.send_recording_name(", ".join(names))
     for index, (root, rollout, each) in enumerate(zip(roots, rollouts, contents, strict=True)):
-        _log_rollout(recording, root, rollout, each, {"episode": 0, "env_step": 0, **(times or {})})
+        _log_rollout(recording, root, rollout, each)
         if len(roots) > 1:
             curve = rr.SeriesLines(names=[names[index]], colors=[_COLOURS[index % len(_COLOURS)]])
             recording.log(f"{root}/plots/coverage", curve, static=True)
 
 
-def _log_rollout(
-    recording: rr.RecordingStream, root: str, rollout: Rollout, contents: RolloutContents, times: Mapping[str, Time]
-) -> None:
+def _log_rollout(recording: rr.RecordingStream, root: str, rollout: Rollout, contents: RolloutContents) -> None:
+    times = {"episode": 0, "env_step": 0}
     log_episode(recording, root, contents.episode, times=times)
     log_room(recording, f"{root}/world/room", contents.room)
     if contents.map is not None:
         recording.log(f"{root}/map", rr.EncodedImage(contents=contents.map, media_type="image/png"), static=True)
     about = rr.TextDocument(_about(rollout), media_type=rr.MediaType.MARKDOWN)
     recording.log(f"{root}/about", about, static=True)
-    times = {"step": max(len(rollout.frames) - 1, 0), **times}
+    times["step"] = max(len(rollout.frames) - 1, 0)
     for name, value in rollout.meta.get("metrics", {}).items():
         log_at(recording, metric_path(root, name), rr.Scalars(value), times)
 
 
 def write_rollout_recording(folders: Sequence[str | Path], target: str | Path, *, progress: bool = False) -> Path:
     """Write one `.rrd` file with each rollout under its folder's name; the file appears when it is whole.
-
-    Args:
-        folders: rollout folders.
-        target: the file to make.
-        progress: as for `log_rollouts`.
 
     Raises:
         UsageError: the target exists, or no folder is given.

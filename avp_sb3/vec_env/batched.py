@@ -1,6 +1,5 @@
 """Many agents in one or more scenes as one Stable-Baselines3 `VecEnv`: one task, and one call for all their views."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,23 +15,24 @@ from avp_habitat.poses import Intrinsics
 from avp_habitat.ranges import Range, number
 from avp_habitat.simulators.base import Frames, Simulator, SingleRays, pictures
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
-from avp_habitat.surface.points import scene_surface
 from avp_habitat.task.env import step_info
-from avp_habitat.task.observations import Observed, action_space, each, make_observation
+from avp_habitat.task.observations import Observed, action_space, each
 from avp_habitat.task.settings import TaskSettings
 from avp_habitat.task.task import ViewpointTask
+
+Scenes = str | Path | Sequence[str | Path]
+"""One, or several that agents take in turn."""
 
 
 class AVPVecEnv(VecEnv):
     """n agents of `AVP-v0`; the same task, observations, rewards and `info` as n separate `AVPEnv`s.
 
-    Wrap it in SB3's `VecMonitor` for the episode rewards and lengths that SB3 prints. With `settings.lookup=True` it
-    is two orders of magnitude faster (see `avp_habitat.lookup`).
+    Wrap it in SB3's `VecMonitor` for the episode rewards and lengths that SB3 prints.
     """
 
     def __init__(
         self,
-        scene: str | Path | Sequence[str | Path] = "builtin:0",
+        scene: Scenes = "builtin:0",
         *,
         agents: int = 16,
         simulator: str | Simulator | Sequence[Simulator] = "raycast",
@@ -47,16 +47,15 @@ class AVPVecEnv(VecEnv):
         Args:
             scene: as `scenes.location.locate` takes it, or several; agent i walks in scene i modulo their number.
             agents: n, at least 1, and at least one for each scene.
-            simulator: a simulator's name or factory, or those that are open already, one for each scene (names are then
-                theirs).
+            simulator: a simulator's name or factory, or those that are open already, one for each scene.
             gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
             navmesh: file of the only scene's NavMesh; computed when omitted.
             up: axis of mesh files that points up, `y` or `z`; of each file what is known of it when omitted.
-            settings: of the task; when omitted, the design's defaults, looked up where the simulator casts rays.
+            settings: of the task; when omitted, the defaults, looked up where the simulator casts rays.
             seed: of the starts; agent i uses `seed + i`, as SB3 seeds separate environments.
 
         Raises:
-            UsageError: too few agents, more than memory allows, or an unknown name.
+            UsageError: too few agents, or an unknown name.
             SceneError: a scene cannot be used; the text names it.
             SimulatorError: the simulator cannot run here, or several scenes need a process each (`AVPSubprocVecEnv`).
         """
@@ -66,7 +65,6 @@ class AVPVecEnv(VecEnv):
         agents = number("agents", agents, int, Range(0, 1e12))
         if agents < len(self.simulators):
             raise UsageError(f"agents: expected at least {len(self.simulators)}, one for each scene, got {agents}")
-        _check_memory(agents, self.simulators, self.settings)
         self.render_mode = None
         self._task = ViewpointTask(self.simulators, self.settings, agents)
         super().__init__(agents, self._task.kind.space, action_space())
@@ -115,9 +113,7 @@ class AVPVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """An attribute of the chosen agents, as separate `AVPEnv`s have it."""
-        read = _OF_AGENT.get(attr_name)
-        if read is None:
-            return [getattr(self, attr_name) for _ in self._get_indices(indices)]
+        read = _OF_AGENT.get(attr_name, lambda *_: getattr(self, attr_name))
         return [read(self._task, row) for row in self._get_indices(indices)]
 
     def has_attr(self, attr_name: str) -> bool:
@@ -126,7 +122,7 @@ class AVPVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Refused: the agents share one task, whose settings are frozen."""
-        raise UsageError(f"AVPVecEnv: {attr_name} cannot be set after the environment was made; give it as settings")
+        raise UsageError(f"AVPVecEnv: {attr_name} cannot be set after it was made; give it as settings")
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
         """Call a method once for each chosen agent; `capture` looks into that agent's scene."""
@@ -157,22 +153,7 @@ _OF_AGENT = {
 }
 
 
-def _check_memory(agents: int, simulators: Sequence[Simulator], settings: TaskSettings) -> None:
-    """Refuse what would end in the middle of making it: the agents' cells, surfaces, paths, logs and observations."""
-    cells = max(len(simulator.area.centres) for simulator in simulators)
-    numbers = gymnasium.spaces.flatdim(make_observation(settings).space)
-    points = max(len(scene_surface(each, settings).points) for each in simulators) if settings.with_surface else 0
-    needed = agents * (2 * cells + 4 * points + 8 * 24 * (settings.budget + 1) + 3 * 4 * numbers)
-    free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    if needed > free:
-        raise UsageError(
-            f"agents: {agents} need about {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; take fewer"
-        )
-
-
-def _open(
-    scene: str | Path | Sequence[str | Path], simulator: str | Simulator | Sequence[Simulator], **options: Any
-) -> list[Simulator]:
+def _open(scene: Scenes, simulator: str | Simulator | Sequence[Simulator], **options: Any) -> list[Simulator]:
     choice = SimulatorChoice.by_name(simulator, **options)
     if choice is None:
         return list(simulator) if isinstance(simulator, Sequence) else [simulator]  # type: ignore[list-item]
@@ -180,17 +161,13 @@ def _open(
     if len(scenes) > 1 and choice.one_per_process:
         raise UsageError(
             f"AVPVecEnv: a process can hold one {choice.name!r} simulator, expected one scene, got {len(scenes)}: "
-            f"{', '.join(scenes)}; use AVPSubprocVecEnv, which gives each scene a process of its own"
+            f"{', '.join(scenes)}; use AVPSubprocVecEnv (rl_zoo3: --vec-env subproc), which gives each its own process"
         )
     return [open_simulator(choice, name) for name in scenes]
 
 
-def scenes_given(scene: str | Path | Sequence[str | Path], choice: SimulatorChoice) -> list[str]:
-    """The scenes as a list of strings.
-
-    Raises:
-        UsageError: there are none, or several for one NavMesh.
-    """
+def scenes_given(scene: Scenes, choice: SimulatorChoice) -> list[str]:
+    """The scenes as a list of strings; at least one, and several only without a NavMesh."""
     scenes = list(map(str, [scene] if isinstance(scene, (str, Path)) else scene))
     if not scenes:
         raise UsageError("scene: expected at least one, got none")

@@ -21,19 +21,12 @@ from avp_habitat.errors import AVPError, SimulatorError, UsageError
 from avp_habitat.simulators.registry import SimulatorChoice
 from avp_habitat.task.observations import Observed, action_space, each, make_observation
 from avp_habitat.task.settings import TaskSettings
-from avp_sb3.vec_env.batched import AVPVecEnv, scenes_given
+from avp_sb3.vec_env.batched import AVPVecEnv, Scenes, scenes_given
 
 START_METHODS = ("forkserver", "spawn")
 _GUARD = '; a script that starts workers needs the guard `if __name__ == "__main__":`, because they import it'
 _GRACE_S = 5.0
 """How long a worker may take to end by itself, seconds."""
-_GONE = (EOFError, BrokenPipeError, ConnectionResetError)
-"""What a pipe raises when the process at its other end has ended."""
-_HINTS = {
-    "SIGKILL": " (by somebody, or by the system for want of memory)",
-    "SIGSEGV": " (a crash inside the simulator)",
-    "SIGABRT": " (a crash inside the simulator)",
-}
 _FIXED = ("area", "scene_name", "scene_digest", "settings", "render_mode")
 """Attributes that never change: known also when the workers have ended, so that the last path can be drawn."""
 
@@ -64,16 +57,16 @@ class _Agents(gymnasium.Env):
 class AVPSubprocVecEnv(SubprocVecEnv):
     """n agents of `AVP-v0` over worker processes, each of which steps its agents in one scene as an `AVPVecEnv`.
 
-    For simulators of which a process can hold one only (Habitat-Sim), and for several cores or GPUs. Observations,
-    rewards and `info` are those of `AVPVecEnv` with the same scenes, agents, settings and seed. A program that makes
-    one needs the guard `if __name__ == "__main__":`, because its workers import it.
+    For simulators of which a process can hold one only (Habitat-Sim), and for several cores or GPUs; the numbers are
+    those of `AVPVecEnv`. A program that makes one needs the guard `if __name__ == "__main__":`, because its workers
+    import it.
 
     A worker that fails or ends becomes one error that names it and its scene; where it has ended, so do the others.
     """
 
     def __init__(
         self,
-        scene: str | Path | Sequence[str | Path] = "builtin:0",
+        scene: Scenes = "builtin:0",
         *,
         agents: int | None = None,
         workers: int | None = None,
@@ -85,20 +78,12 @@ class AVPSubprocVecEnv(SubprocVecEnv):
         seed: int | None = None,
         start_method: str = "forkserver",
     ) -> None:
-        """Start the workers, and wait until all scenes are open.
+        """Start the workers, and wait until all scenes are open; the arguments are as of `AVPVecEnv`, but for these.
 
-        Args:
-            scene: as of `AVPVecEnv`, like all that is not named here.
-            agents: n, at least one for each worker; one for each when omitted.
-            workers: processes, a multiple of the number of scenes; one for each scene when omitted. Agent i is of
-                worker i modulo their number.
-            simulator: its name.
-            gpu: the CUDA device of `habitat`, or several, of which worker i takes number i modulo their number.
-            navmesh: as of `AVPVecEnv`.
-            up: as of `AVPVecEnv`.
-            settings: as of `AVPVecEnv`.
-            seed: as of `AVPVecEnv`.
-            start_method: `forkserver` or `spawn`; a forked process cannot use a graphics device.
+        `agents` are one for each worker when omitted. `workers` is a multiple of the number of scenes, one for each
+        when omitted; agent i is of worker i modulo their number. The simulator is chosen by name. Of several CUDA
+        devices in `gpu`, worker i takes number i modulo theirs. `start_method` is `forkserver` or `spawn`, because a
+        forked process cannot use a graphics device.
 
         Raises:
             UsageError: numbers that do not fit each other, or an unknown name.
@@ -108,16 +93,13 @@ class AVPSubprocVecEnv(SubprocVecEnv):
         gpus = list(gpu) if isinstance(gpu, Sequence) else [gpu]
         file = Path(navmesh) if navmesh else None
         choices = [SimulatorChoice(simulator, gpu=number, navmesh=file, up=up) for number in gpus]
-        if not choices:
-            raise UsageError("gpu: expected at least one, got none")
         if start_method not in START_METHODS:
             raise UsageError(f"start_method: expected one of {', '.join(START_METHODS)}, got {start_method!r}")
         self.scenes = scenes_given(scene, choices[0])
         """Of the agents in turn, as given."""
         count = len(self.scenes) if workers is None else workers
         if count < 1 or count % len(self.scenes):
-            there_are = "there is 1 scene" if len(self.scenes) == 1 else f"there are {len(self.scenes)} scenes"
-            raise UsageError(f"workers: expected {len(self.scenes)} or a multiple of it, as {there_are}, got {workers}")
+            raise UsageError(f"workers: expected a multiple of the number of scenes, {len(self.scenes)}, got {workers}")
         self._count, self._workers = count, range(count)
         agents = count if agents is None else agents
         if agents < count:
@@ -249,7 +231,7 @@ class AVPSubprocVecEnv(SubprocVecEnv):
         """Within the block, a broken pipe becomes an error that names the worker; the others are ended, too."""
         try:
             yield
-        except _GONE:
+        except (EOFError, BrokenPipeError, ConnectionResetError):
             how = _how_it_ended(self.processes[worker])
             self.close()
             raise SimulatorError(f"{self._name(worker)} {how}; the other workers were ended{hint}") from None
@@ -273,15 +255,16 @@ def _how_it_ended(process: BaseProcess) -> str:
     if code >= 0:
         return f"ended with exit code {code}; what it said last stands above"
     name = signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
-    return f"was killed by {name}{_HINTS.get(name, '')}"
+    by_whom = " (by somebody, or by the system for want of memory)" if -code == signal.SIGKILL else ""
+    return f"was killed by {name}{by_whom}"
 
 
 def _end(processes: Sequence[BaseProcess]) -> None:
-    """Wait for processes whose pipes are closed, and end those that have not ended after a while."""
-    for stop in (None, "terminate", "kill"):
-        late = [process for process in processes if process.is_alive()]
-        for process in late if stop else []:
-            getattr(process, stop or "")()
-        until = time.monotonic() + _GRACE_S
-        for process in late:
-            process.join(max(0.0, until - time.monotonic()))
+    """Wait for processes whose pipes are closed, and kill those that have not ended after a while."""
+    until = time.monotonic() + _GRACE_S
+    for process in processes:
+        process.join(max(0.0, until - time.monotonic()))
+    for process in processes:
+        if process.is_alive():
+            process.kill()
+            process.join()
