@@ -12,11 +12,7 @@ from avp_habitat.errors import AVPError, UsageError
 
 
 def check_new(path: Path, *, option: str = "") -> None:
-    """Refuse a path that exists.
-
-    Args:
-        path: of a new file or folder.
-        option: the command's option that gave it, for the message, for example `--out`.
+    """Refuse a path that exists; the message names the command's option that gave it, for example `--out`.
 
     Raises:
         UsageError: there is something, be it a dangling link.
@@ -26,13 +22,7 @@ def check_new(path: Path, *, option: str = "") -> None:
 
 
 def check_writable(path: Path, *, failure: type[AVPError] = AVPError, option: str = "--out") -> None:
-    """Refuse a result's path before long work; what is made to find out is removed again.
-
-    Args:
-        path: of a new file or folder.
-        failure: what is raised.
-        option: as for `check_new`.
-    """
+    """Refuse a result's path by raising `failure` before long work; what is made to find out is removed again."""
     above = next(folder for folder in path.absolute().parents if folder.exists())
     try:
         with tempfile.TemporaryDirectory(prefix=".avp-", dir=above):
@@ -48,16 +38,13 @@ def atomic_file(
     """A context in which a file is written under another name; it gets its own when the context ends without an error.
 
     A reader, a second writer or a power cut sees the old file or the new one, never a part. Missing folders above it
-    are made. The temporary name is hidden, in the same folder, and ends in the same suffix.
+    are made. The temporary name, which the context gives, is hidden, in the same folder, and ends in the same suffix.
 
     Args:
         path: the final name.
         replace: whether a file of that name is replaced; else it is refused, at the start and at the end.
         failure: what to raise in place of an `OSError`, also of one raised in the context; None lets those through.
         option: as for `check_new`.
-
-    Yields:
-        Where to write.
 
     Raises:
         UsageError: the file exists and is not to be replaced.
@@ -82,17 +69,9 @@ def atomic_file(
 
 @contextmanager
 def atomic_folder(path: str | Path, *, failure: type[AVPError] | None = None, option: str = "") -> Iterator[Path]:
-    """A context in which a folder is filled under another name; it gets its own when the context ends without an error.
+    """As `atomic_file`, for a folder, which must not exist; the temporary one is there and empty.
 
     An error or Ctrl-C removes what was written.
-
-    Args:
-        path: the final name; must not exist. Missing folders above it are made.
-        failure: what to raise in place of an `OSError`, also of one raised in the context; None lets those through.
-        option: as for `check_new`.
-
-    Yields:
-        The temporary folder, empty.
 
     Raises:
         UsageError: the folder exists, now or at the end.

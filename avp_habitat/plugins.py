@@ -58,8 +58,7 @@ def declares(**facts: Any) -> Callable[[Function], Function]:
     """Decorator: what a function declares about itself, as its attributes, which a class says in its body."""
 
     def declared(function: Function) -> Function:
-        for name, value in facts.items():
-            setattr(function, name, value)
+        vars(function).update(facts)
         return function
 
     return declared

@@ -43,13 +43,7 @@ def hold_ranges(settings: Any) -> None:
 
 
 def number(name: str, value: Any, kind: type, limits: Range) -> Any:
-    """A number as `kind` (`int` or `float`).
-
-    Args:
-        name: of the option, for the error.
-        value: what the user gave.
-        kind: what it becomes.
-        limits: of its range.
+    """The number that a user gave for an option as `kind` (`int` or `float`).
 
     Raises:
         UsageError: it is no such number.

@@ -14,16 +14,13 @@ from avp_habitat.scenes.location import HELP, UP_HELP
 
 
 def save_navmesh(scene: str | Path, out: Path, *, gpu: int | None = None, up: str | None = None) -> float:
-    """Compute a scene's NavMesh for the task's agent and write it.
+    """Compute a scene's NavMesh for the task's agent, write it, and give the navigable area in square metres.
 
     Args:
         scene: as for `avp_habitat.scenes.location.locate`.
         out: the file; appears only when it is complete.
         gpu: CUDA device for Habitat-Sim, see `HabitatSimulator`.
         up: axis of a mesh file that points up, `y` or `z`.
-
-    Returns:
-        The navigable area in square metres.
 
     Raises:
         UsageError: the name does not end in `.navmesh`, or the file exists.

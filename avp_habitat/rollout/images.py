@@ -123,12 +123,6 @@ def check_png_structure(path: str, *, width: int, height: int, kind: PngKind) ->
     Two short reads find a file that is empty, cut short or something else. What lies between is not read: that is
     `check_png_contents`.
 
-    Args:
-        path: of the file.
-        width: expected, in pixels.
-        height: expected, in pixels.
-        kind: expected.
-
     Raises:
         RolloutError: the file is unreadable, no whole PNG, or of another size or kind.
     """
@@ -152,11 +146,8 @@ def check_png_structure(path: str, *, width: int, height: int, kind: PngKind) ->
 def check_png_contents(path: Path) -> None:
     """Hold every chunk of a PNG to its checksum (CRC-32), which finds any damaged byte; nothing is decoded.
 
-    Args:
-        path: of a file that passed `check_png_structure`.
-
     Raises:
-        RolloutError: the file is unreadable or damaged.
+        RolloutError: the file, which passed `check_png_structure`, is damaged.
     """
     try:
         with Image.open(path, formats=["PNG"]) as image:

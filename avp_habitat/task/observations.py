@@ -53,9 +53,8 @@ class SceneAgents:
 
     def floor_maps(self) -> NDArray[np.float32]:
         """As `Agents.floor_maps`."""
-        side, views = floor_map.SIDE, self.views
-        maps = self._floor.observe(self._first_seen, self._rows, views.position, views.yaw)
-        return maps.reshape(-1, len(floor_map.CHANNELS), side, side)
+        maps = self._floor.observe(self._first_seen, self._rows, self.views.position, self.views.yaw)
+        return maps.reshape(-1, len(floor_map.CHANNELS), floor_map.SIDE, floor_map.SIDE)
 
     def surface_maps(self) -> NDArray[np.float32]:
         """As `Agents.surface_maps`."""
@@ -194,8 +193,8 @@ class Numbers:
 
     def __init__(self, settings: TaskSettings) -> None:
         """Say the space."""
-        low, high = np.zeros(self.further, np.float32), np.ones(self.further, np.float32)
-        self.space = Box(np.concatenate([LOW, low]), np.concatenate([HIGH, high]), dtype=np.float32)
+        low, high = np.pad(LOW, (0, self.further)), np.ones(len(HIGH) + self.further, np.float32)
+        self.space = Box(low, high, dtype=np.float32)
 
     def __call__(self, agents: Agents) -> NDArray[np.float32]:
         """`(n, 12 + further)` float32."""

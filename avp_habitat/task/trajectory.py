@@ -49,10 +49,6 @@ def episode_metrics(trajectory: Trajectory, *, stopped: bool, further: Sequence[
         trajectory: of the whole episode.
         stopped: whether the agent ended it with enough coverage.
         further: metrics of the user, as `TaskSettings.metrics`.
-
-    Returns:
-        coverage, views, annd_m, ei, path_length_m, collisions, redundant_views, stopped, `return_PART` for each part of
-        the reward, surface where it was computed, and those of the further metrics.
     """
     surface = {} if trajectory.surface is None else {"surface": trajectory.surface}
     views = len(trajectory.action)
