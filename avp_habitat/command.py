@@ -72,11 +72,8 @@ def _interrupt(signum: int, _frame: object) -> None:
 def run(main: Callable[[Any], None], argv: Sequence[str] | None = None) -> int:
     """Run a command and turn its outcome into an exit code: 0, or 1 (failure), 2 (usage), 130 (interrupted).
 
-    A SIGTERM ends the command like Ctrl-C, so that temporary folders are removed.
-
-    Args:
-        main: takes the options that its annotation names (`parse`), or else the list of words.
-        argv: the arguments; the process's own when omitted.
+    `main` takes the options that its annotation names (`parse`), or else the list of words. A SIGTERM ends the command
+    like Ctrl-C, so that temporary folders are removed.
     """
     words = sys.argv[1:] if argv is None else argv
     options = next(iter(get_type_hints(main).values()), None)
@@ -123,11 +120,9 @@ class _Lines:
 
 
 def progress(work: Iterable[Any] | None = None, **options: Any) -> tqdm:
-    """Tqdm's bar; without a terminal it prints a line at the start, every ten seconds and at the end.
+    """Tqdm's bar, whose options are at least `desc` and `unit`, and `total` where `work` has no length.
 
-    Args:
-        work: to go through; None to call `update`.
-        **options: tqdm's, `desc` and `unit` at least; `total` where `work` has no length.
+    Without a terminal it prints a line at the start, every ten seconds and at the end.
     """
     if sys.stderr.isatty():
         return tqdm(work, **options)

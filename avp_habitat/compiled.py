@@ -28,7 +28,8 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         except RuntimeError as error:
             if "cannot cache function" not in str(error):
                 raise
-        return numba.njit(**options | {"cache": _elsewhere()})(function)
+        again: dict[str, Any] = {**options, "cache": _elsewhere()}
+        return numba.njit(**again)(function)
 
     return compiled
 

@@ -52,19 +52,14 @@ def atomic_file(
     path = Path(path)
     if not replace:
         check_new(path, option=option)
-    partial = _partial(path)
-    with _failing_as(failure, _named(path, option)):
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            yield partial
-            with partial.open("rb") as file:
-                os.fsync(file.fileno())
-            if not replace:
-                check_new(path, option=option)
-            partial.replace(path)
-        finally:
-            with suppress(OSError):
-                partial.unlink(missing_ok=True)
+    with _partial(path, failure, option) as partial:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield partial
+        with partial.open("rb") as file:
+            os.fsync(file.fileno())
+        if not replace:
+            check_new(path, option=option)
+        partial.replace(path)
 
 
 @contextmanager
@@ -78,32 +73,30 @@ def atomic_folder(path: str | Path, *, failure: type[AVPError] | None = None, op
     """
     path = Path(path)
     check_new(path, option=option)
-    partial = _partial(path)
-    with _failing_as(failure, _named(path, option)):
-        try:
-            partial.mkdir(parents=True)
-            yield partial
-            if path.exists():
-                raise UsageError(f"{_named(path, option)}: another program made it meanwhile; nothing was replaced")
-            partial.rename(path)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+    with _partial(path, failure, option) as partial:
+        partial.mkdir(parents=True)
+        yield partial
+        if path.exists():
+            raise UsageError(f"{_named(path, option)}: another program made it meanwhile; nothing was replaced")
+        partial.rename(path)
 
 
 def _named(path: Path, option: str) -> str:
     return f"{option} {path}".lstrip()
 
 
-def _partial(path: Path) -> Path:
-    # Libraries choose a file's format by its suffix, which therefore stays the last part of the name.
-    return path.with_name(f".{path.stem}.partial-{secrets.token_hex(4)}{path.suffix}")
-
-
 @contextmanager
-def _failing_as(failure: type[AVPError] | None, named: str) -> Iterator[None]:
+def _partial(path: Path, failure: type[AVPError] | None, option: str) -> Iterator[Path]:
+    """A path for a temporary file or folder, which is removed in the end."""
+    # Libraries choose a file's format by its suffix, which therefore stays the last part of the name.
+    partial = path.with_name(f".{path.stem}.partial-{secrets.token_hex(4)}{path.suffix}")
     try:
-        yield
+        yield partial
     except OSError as error:
         if failure is None:
             raise
-        raise failure(f"{named}: cannot write there: {error.strerror or error}") from error
+        raise failure(f"{_named(path, option)}: cannot write there: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)

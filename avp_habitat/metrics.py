@@ -190,11 +190,9 @@ def efficiency_index(coverage: float, images: int) -> float:
 
 
 def coverage_per_view(coverages: Float, lengths: Float) -> float:
-    """Percent of coverage per step (CpV = 100 · mean C / mean episode length); 0.0 without episodes.
+    """Percent of coverage per step (CpV = 100 · mean C / mean episode length) of n episodes; 0.0 without any.
 
-    Args:
-        coverages: `(n,)` final coverage of n episodes, within [0, 1].
-        lengths: `(n,)` their lengths in steps.
+    Their final coverages are `(n,)` within [0, 1], their lengths `(n,)` steps.
     """
     return float(100 * np.mean(coverages) / np.mean(lengths)) if len(lengths) else 0.0
 
@@ -209,14 +207,9 @@ CONFIDENCE = 0.95
 
 
 def mean_and_half_width(values: ArrayLike, *, confidence: float = CONFIDENCE) -> tuple[NDArray, NDArray]:
-    """Mean over episodes or runs, and half the width of its confidence interval (Student's t, n - 1 degrees).
+    """Mean of `(n, ...)` values over n episodes or runs, and half the width of its confidence interval, `(...)` each.
 
-    Args:
-        values: `(n, ...)` a figure of each of n episodes, n at least 1.
-        confidence: within (0, 1).
-
-    Returns:
-        `(...)` each; the half width is nan for one episode, of whose spread nothing is known.
+    By Student's t with n - 1 degrees; nan for one episode, of whose spread nothing is known.
     """
     from scipy import stats
 

@@ -78,12 +78,8 @@ def name_of(thing: Any) -> str:
 
 
 @cache
-def _all_registered() -> Any:
-    return entry_points()
-
-
 def _registered(group: str) -> Iterable[EntryPoint]:
-    return _all_registered().select(group=group)
+    return entry_points(group=group)
 
 
 def _owner(point: EntryPoint) -> str:

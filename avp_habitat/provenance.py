@@ -7,17 +7,8 @@ from collections.abc import Iterable, Mapping
 from importlib import metadata
 from typing import Any
 
-PACKAGES = (
-    "avp-suite",
-    "stable-baselines3",
-    "nerfstudio",
-    "torch",
-    "gymnasium",
-    "numpy",
-    "open3d",
-    "mlflow",
-    "rerun-sdk",
-)
+_HOSTS = ("stable-baselines3", "nerfstudio", "torch", "gymnasium", "numpy", "open3d", "mlflow", "rerun-sdk")
+PACKAGES = ("avp-suite", *_HOSTS)
 """The suite, and what its results depend on most."""
 
 

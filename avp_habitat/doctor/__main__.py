@@ -3,7 +3,7 @@
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +14,7 @@ from avp_habitat.doctor import ABSENT, BROKEN, OK, Finding, ask
 from avp_habitat.errors import AVPError, SimulatorError
 from avp_habitat.provenance import version_of
 from avp_habitat.simulators.habitat.graphics import FIRST_DEVICE, choose_gpu, inspect_graphics
-from avp_habitat.simulators.habitat.installed import inspect_installation, require_installed
+from avp_habitat.simulators.habitat.installed import inspect_installation
 
 LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"
 # One of the suite's kernels stands for all.
@@ -29,16 +29,12 @@ Check = Callable[[], list[Finding]]
 def check_simulator(name: str) -> list[Finding]:
     """Whether a simulator opens the built-in room and renders, or why not."""
     subject = f"simulator {name}"
-    try:
-        if name == "habitat":
-            require_installed()
-    except SimulatorError as error:
-        return [Finding(BROKEN if inspect_installation().installed else ABSENT, subject, str(error))]
     found, failure = ask(doctor.probe(doctor.open_room, name), time_limit_s=120.0)
     if failure is not None:
         more = f"python -c 'from avp_habitat.doctor import open_room; print(open_room(\"{name}\"))'"
         return [Finding(BROKEN, subject, f"{failure}; the whole message: {more}")]
-    return [Finding(found["mark"], subject, found["text"])]
+    absent = name == "habitat" and not inspect_installation().installed
+    return [Finding(ABSENT if absent else found["mark"], subject, found["text"])]
 
 
 def check_graphics() -> list[Finding]:
@@ -113,15 +109,6 @@ def all_checks() -> dict[str, Check]:
     }
 
 
-def findings_of(checks: Mapping[str, Check]) -> Iterator[Finding]:
-    """The findings in the order of the checks, each as soon as it and those before it are known."""
-    with ThreadPoolExecutor(max_workers=max(3, os.cpu_count() or 1)) as pool:
-        for name, future in {name: pool.submit(check) for name, check in checks.items()}.items():
-            if sys.stderr.isatty() and not future.done():
-                print(f"looking at {name} ...\033[K", end="\r", file=sys.stderr, flush=True)
-            yield from future.result()
-
-
 @dataclass(frozen=True)
 class Doctor:
     """What is installed, what can run here and what the hosts see: ok, -- (not here, optional), !! (broken).
@@ -134,12 +121,16 @@ class Doctor:
 
 
 def main(options: Doctor) -> None:
-    """Run every check and print what was found; an error when something is broken."""
-    found = []
-    for finding in findings_of(all_checks()):
-        found.append(finding)
-        if not options.json:
-            print(finding.line(colour=sys.stdout.isatty()), flush=True)
+    """Run every check side by side and print what was found in order; an error when something is broken."""
+    found: list[Finding] = []
+    with ThreadPoolExecutor(max_workers=max(3, os.cpu_count() or 1)) as pool:
+        for name, future in {name: pool.submit(check) for name, check in all_checks().items()}.items():
+            if sys.stderr.isatty() and not future.done():
+                print(f"looking at {name} ...\033[K", end="\r", file=sys.stderr, flush=True)
+            found += future.result()
+            if not options.json:
+                for finding in future.result():
+                    print(finding.line(colour=sys.stdout.isatty()), flush=True)
     broken = [finding.subject for finding in found if finding.mark == BROKEN]
     if options.json:
         print(json.dumps({"ok": not broken, "findings": [finding._asdict() for finding in found]}, indent=2))

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from avp_habitat import poses
 from avp_habitat.errors import AVPError, SceneError, UsageError
+from avp_habitat.files import check_new
 from avp_habitat.metrics import measured
 from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.plugins import name_of
@@ -42,7 +43,6 @@ MIN_MEAN_DEPTH_M = 1.0
 _TRIES = 2000
 _VERSIONED = ("avp-suite", "numpy", "gymnasium", "open3d", "pillow", "stable-baselines3", "torch")
 _FLOOR_FILE = "floor.png"
-_PICTURE = (640, 480)
 
 
 def heldout_seed(scene_digest: str) -> int:
@@ -85,14 +85,7 @@ def capture_step(env: AVPEnv, writer: RolloutWriter, action: int, reward: float,
 def capture_heldout(
     env: AVPEnv, writer: RolloutWriter, views: int, *, progress: Callable[[], object] = lambda: None
 ) -> None:
-    """Write the scene's held-out views.
-
-    Args:
-        env: the environment, not wrapped.
-        writer: an entered one; its camera takes the pictures.
-        views: how many, 0 for none.
-        progress: called after each view.
-    """
+    """Write so many held-out views of the scene; `progress` is called after each."""
     if not views:
         return
     for pose in heldout_poses(env.simulator, sensor_height_m=env.settings.sensor_height_m, views=views):
@@ -134,7 +127,10 @@ def publish_rollout(
     floor = _write_floor(env.area, info["avp_trajectory"], writer)
     frames, views = writer.views(heldout=False), writer.views(heldout=True)
     rollout = Rollout(writer.path(""), _scene_and_task(env, heldout), writer.intrinsics, frames, views)
-    metrics = info["avp_episode"] | _visibility(rollout) | measured(env.settings.metrics, "rollout", rollout)
+    # From the files, in whole millimetres, so that the figure is the one that a reader of the folder computes.
+    seen = visibility_of(frames, views, writer.intrinsics).figures() if views else {}
+    visibility = {"visibility": seen["visibility"]} if "visibility" in seen else {}
+    metrics = info["avp_episode"] | visibility | measured(env.settings.metrics, "rollout", rollout)
     about = {"policy": policy, "seed": seed, "metrics": metrics, "floor": floor, "mlflow_run_id": mlflow_run_id}
     writer.publish(rollout.meta | about)
     return metrics
@@ -151,14 +147,6 @@ def _write_floor(area: NavigableArea, trajectory: Trajectory, writer: RolloutWri
         "origin_m": [float(value) for value in area.origin],
         "shape": list(area.mask.shape),
     }
-
-
-def _visibility(rollout: Rollout) -> dict[str, float]:
-    """From the files, in whole millimetres, so that the figure is the one that a reader of the folder computes."""
-    if not rollout.heldout:
-        return {}
-    found = visibility_of(rollout.frames, rollout.heldout, rollout.intrinsics).figures()
-    return {name: value for name, value in found.items() if name == "visibility"}
 
 
 def _step_row(env: AVPEnv, action: int, reward: float, info: dict[str, Any]) -> dict[str, Any]:
@@ -188,10 +176,7 @@ def _scene_and_task(env: AVPEnv, heldout: int) -> dict[str, Any]:
         "budget": settings.budget,
         "actions": {
             "names": list(ACTION_NAMES),
-            "forward_m": settings.forward_m,
-            "turn_deg": settings.turn_deg,
-            "tilt_deg": settings.tilt_deg,
-            "pitch_limit_deg": settings.pitch_limit_deg,
+            **{name: getattr(settings, name) for name in ("forward_m", "turn_deg", "tilt_deg", "pitch_limit_deg")},
         },
         "camera": {"hfov_deg": settings.hfov_deg, "height_above_floor_m": settings.sensor_height_m},
         "coverage": {
@@ -224,8 +209,8 @@ class RecordRollout(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         *,
         episodes: int = 1,
         heldout: int = VIEWS,
-        width: int = _PICTURE[0],
-        height: int = _PICTURE[1],
+        width: int = 640,
+        height: int = 480,
         policy: str = "not named",
     ) -> None:
         """Wrap an environment.
@@ -258,7 +243,7 @@ class RecordRollout(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         later = [first.with_name(f"{first.name}-{number}") for number in range(2, episodes + 1)]
         self._targets = [first, *later]
         for target in self._targets:
-            RolloutWriter(target, self._camera)  # Refuses a folder that exists, before any episode was run.
+            check_new(target)
         self._seed: int | None = None
         self._writer: RolloutWriter | None = None
         self._open = ExitStack()
@@ -267,8 +252,7 @@ class RecordRollout(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode, recorded if there are folders left to write."""
-        self._open.close()
-        self._writer = None
+        self._drop()
         answer = self.env.reset(seed=seed, options=options)
         self._seed = seed
         if self._targets:
@@ -290,9 +274,12 @@ class RecordRollout(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
 
     def close(self) -> None:
         """Drop an unfinished recording and close the environment."""
+        self._drop()
+        super().close()
+
+    def _drop(self) -> None:
         self._open.close()
         self._writer = None
-        super().close()
 
     def _record(self, writer: RolloutWriter, action: int, reward: float, info: dict[str, Any], *, ended: bool) -> None:
         capture_step(self._avp, writer, action, reward, info)
@@ -311,23 +298,17 @@ class RecordRollout(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         episode = info["avp_episode"]
         print(f"{writer.folder}: {episode['views']:.0f} views, coverage {100 * episode['coverage']:.1f} %")
         del self._targets[0]
-        self._writer = None
-        self._open.close()
+        self._drop()
 
 
 def make_env(*, record: str | Path | None = None, record_options: dict[str, Any] | None = None, **kwargs: Any) -> Any:
-    """`AVP-v0` as gymnasium makes it: an `AVPEnv`, within a `RecordRollout` where a folder is given.
+    """`AVP-v0` as gymnasium makes it: an `AVPEnv`, within a `RecordRollout` where the folder `record` is given.
 
-    Args:
-        record: the rollout folder of the first episode; nothing is recorded when omitted.
-        record_options: further arguments of `RecordRollout`, for example `{"episodes": 3}`.
-        **kwargs: of `AVPEnv`.
+    The record's options are further arguments of `RecordRollout`, for example `{"episodes": 3}`.
 
     Raises:
-        UsageError: as `AVPEnv` and `RecordRollout`, or options for a recording without a folder.
-        SceneError: as `AVPEnv`.
-        SimulatorError: as `AVPEnv`.
-        SystemExit: instead of these in a worker of SB3's `SubprocVecEnv`, which then ends with one line.
+        AVPError: as `AVPEnv` and `RecordRollout`, or options for a recording without a folder.
+        SystemExit: instead in a worker of SB3's `SubprocVecEnv`, which then ends with one line.
     """
     try:
         if record is None and record_options:

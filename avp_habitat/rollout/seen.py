@@ -16,11 +16,7 @@ def visibility_of(
     On 20 views the default grid's shares differ from those of all pixels by 0.06 to 0.2 percentage points (standard
     deviation over where the grid begins), those of a single view by about 1.
 
-    Args:
-        frames: captured, in the order of capture.
-        heldout: the held-out views.
-        intrinsics: of all pictures.
-        stride: every so many-th row and column of the held-out views is tested; by default about 1,200 pixels of each.
+    Every `stride`-th row and column of the held-out views is tested; by default about 1,200 pixels of each.
 
     Raises:
         RolloutError: a depth picture cannot be decoded.

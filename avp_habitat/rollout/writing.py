@@ -76,7 +76,7 @@ class RolloutWriter:
         self._add("", rgb, depth, pose)
 
     def add_heldout(self, rgb: NDArray[np.uint8], depth: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
-        """Write the next held-out view: `(h, w, 3)` uint8, `(h, w)` metres, `(4, 4)` habitat camera_to_world."""
+        """Write the next held-out view, as `add_frame` takes it."""
         self._add(HELDOUT, rgb, depth, pose)
 
     def add_step(self, row: Mapping[str, Any]) -> None:
@@ -94,10 +94,7 @@ class RolloutWriter:
         return self._partial / name
 
     def publish(self, meta: Mapping[str, Any]) -> Path:
-        """Write the tables, then give the folder its final name.
-
-        Args:
-            meta: the keys of `rollout.json` beyond format, counts, camera size and pose convention.
+        """Write the tables, `rollout.json` with these further keys, then give the folder its final name.
 
         Raises:
             UsageError: a folder of that name has appeared meanwhile.

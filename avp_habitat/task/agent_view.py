@@ -30,11 +30,7 @@ class SimulatorElsewhere:
         return cls(**{field.name: getattr(simulator, field.name) for field in fields(cls)})
 
     def render(self, *_: Any, **__: Any) -> NoReturn:
-        """Refused.
-
-        Raises:
-            SimulatorError: always.
-        """
+        """Refused by a `SimulatorError`."""
         raise SimulatorError(
             f"{self.scene}: its simulator is in another process and cannot be asked for views here; run a planner that "
             "looks at the whole scene (oracle, survey) without SubprocVecEnv"

@@ -83,8 +83,7 @@ class AVPEnv(gymnasium.Env[Observed, np.int64]):
 
         Raises:
             UsageError: the simulator was given open, or its NavMesh is that of the present scene.
-            SceneError: the scene cannot be used.
-            SimulatorError: the simulator cannot open it.
+            AVPError: as for a new environment.
         """
         if self.choice is None:
             raise UsageError("change_scene: expected a simulator chosen by name, got one that was open already")
@@ -130,9 +129,7 @@ class AVPEnv(gymnasium.Env[Observed, np.int64]):
     ) -> tuple[Observed, dict[str, Any]]:
         """Start an episode at a random navigable point and heading.
 
-        Args:
-            seed: of the environment's random generator.
-            options: `position` (x, z or x, y, z in metres) and `yaw` (radians) place the agent instead.
+        The options `position` (x, z or x, y, z in metres) and `yaw` (radians) place the agent instead.
 
         Raises:
             UsageError: the given position is not navigable.

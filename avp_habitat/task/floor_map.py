@@ -88,13 +88,8 @@ class MapObserver:
     ) -> NDArray[np.float32]:
         """`(k, SIZE)` within [0, 1], channel after channel, row after row from ahead to behind, left to right.
 
-        What lies beyond the map is drawn on its border, frontiers only.
-
-        Args:
-            first_seen: `(n, >= m)` 0 for cells not observed.
-            rows: `(k,)` the agents' rows of it.
-            position: `(k, 3)` their feet, metres.
-            yaw: `(k,)` radians.
+        What lies beyond the map is drawn on its border, frontiers only. The agents' feet are `(k, 3)` metres; the rest
+        is as for `draw`.
         """
         maps = np.zeros((len(rows), len(CHANNELS), SIDE, SIDE), dtype=np.float32)
         place = (np.asarray(position)[:, [0, 2]] - self._origin) / self._cell_m

@@ -66,10 +66,7 @@ class SceneAgents:
 
 @dataclass(frozen=True)
 class Agents:
-    """n agents at this moment, from which observations are computed; every array's first axis is n.
-
-    Methods compute what they return, for those kinds of observation that ask for it.
-    """
+    """n agents at this moment, from which observations are computed; every array's first axis is n."""
 
     settings: TaskSettings
     """Of the task."""
@@ -268,12 +265,8 @@ def _fitted(space: gymnasium.Space[Any], value: Any, agents: int, where: str) ->
     bounds = isinstance(space, Box)
     inside = (array >= space.low) & (array <= space.high) if bounds else np.array([*map(space.contains, array)])
     if not inside.all():
-        raise UsageError(f"{where}: expected values within {_range(space)}, got {array[~inside].flat[0]}")
+        raise UsageError(f"{where}: expected values within {space}, got {array[~inside].flat[0]}")
     return array
-
-
-def _range(space: gymnasium.Space[Any]) -> str:
-    return f"[{space.low.min():g}, {space.high.max():g}]" if isinstance(space, Box) else str(space)
 
 
 def each(function: Callable[..., Any], *observed: Observed) -> Observed:

@@ -12,7 +12,6 @@ from avp_habitat import plugins
 from avp_habitat.errors import UsageError
 from avp_habitat.ranges import Range, hold_ranges
 
-Float = NDArray[np.floating]
 Number = NDArray[np.number]
 Bool = NDArray[np.bool_]
 Amount = Annotated[float, Range(0, 1000)]

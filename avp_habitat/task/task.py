@@ -23,7 +23,7 @@ from avp_habitat.task.observations import Agents, Observed, SceneAgents, make_ob
 from avp_habitat.task.rewards import StepFacts, find_reward, has_stop, reward_parts, stops_episode
 from avp_habitat.task.settings import MOVE_FORWARD, STOP, TaskSettings
 from avp_habitat.task.trajectory import Trajectory
-from avp_habitat.task.views import Sensor, Shown, Views, centre_depth
+from avp_habitat.task.views import Shown, Views
 
 Float = NDArray[np.floating]
 Rows = NDArray[np.int64]
@@ -52,7 +52,7 @@ class _Room:
     """One scene and the agents in it."""
 
     simulator: Simulator
-    sensor: Sensor
+    sensor: CastSensor | TableSensor
     floor: MapObserver
     surface: RoomSurface | None
     rows: Rows
@@ -64,10 +64,7 @@ class ViewpointTask:
     def __init__(self, simulators: Simulator | Sequence[Simulator], settings: TaskSettings, agents: int) -> None:
         """Make room for n agents, at least 1; `reset` places them.
 
-        Args:
-            simulators: one for each scene; agent i is in scene i modulo their number.
-            settings: of the task.
-            agents: n.
+        With several simulators, one for each scene, agent i is in scene i modulo their number.
 
         Raises:
             UsageError: the settings ask for what a simulator cannot do.
@@ -86,8 +83,7 @@ class ViewpointTask:
         self._diameter = np.array([area.diameter_m for area in areas])
         self.steps = np.zeros(agents, dtype=np.int64)
         self.position = np.zeros((agents, 3))
-        self.yaw = np.zeros(agents)
-        self.pitch = np.zeros(agents)
+        self.yaw, self.pitch = np.zeros((2, agents))
         self._first_seen = np.zeros((agents, self._cells.max()), dtype=np.int16)
         self._observed = np.zeros(agents, dtype=np.int64)
         self._collided = np.zeros(agents, dtype=np.bool_)
@@ -122,8 +118,12 @@ class ViewpointTask:
         return None if surface is None else float(surface.quality(row).mean())
 
     def centre_depth(self, row: int) -> float:
-        """Planar depth in metres in the middle of an agent's newest view, the whole range where nothing is hit."""
-        return float(centre_depth(self.simulator(row), self.settings, self._views(np.array([row])))[0])
+        """Planar depth in metres at an agent's newest view's middle pixel, the whole range where nothing is hit."""
+        whole = self.settings.intrinsics
+        column, line = whole.width // 2, whole.height // 2
+        pixel = poses.Intrinsics(1, 1, whole.fx, whole.fy, whole.cx - column, whole.cy - line)
+        pose = self._views(np.array([row])).camera_to_world
+        return float(self.simulator(row).render(pose, pixel, rgb=False).depth[0, 0, 0]) or self.settings.max_range_m
 
     @property
     def coverage(self) -> NDArray[np.float64]:
@@ -138,10 +138,7 @@ class ViewpointTask:
     def reset(self, rows: Sequence[int] | NDArray[np.integer], position: Float, yaw: Float) -> Observed:
         """Start new episodes of some agents, looking straight ahead; these views are not captured.
 
-        Args:
-            rows: which agents.
-            position: `(len(rows), 3)` their feet, metres.
-            yaw: `(len(rows),)` radians.
+        Their feet are `(len(rows), 3)` metres, their yaw is `(len(rows),)` radians.
         """
         rows = np.asarray(rows, dtype=np.int64)
         self.position[rows], self.yaw[rows], self.pitch[rows] = position, poses.wrap_angle(yaw), 0.0
@@ -165,14 +162,7 @@ class ViewpointTask:
         parts = reward_parts(self._reward, facts, self.settings.constants)
         reward = np.sum(list(parts.values()), axis=0) + np.zeros(self.agents)
         terminated = stops_episode(facts, self.settings.constants)
-        self._record(
-            parts,
-            action=actions,
-            reward=reward,
-            coverage=facts.coverage,
-            collided=facts.collided,
-            redundant=facts.redundant,
-        )
+        self._record(actions, reward, parts, facts)
         return StepOutcome(
             observation=self._observe(self._everyone, seen, facts.spread_m),
             reward=reward,
@@ -255,7 +245,8 @@ class ViewpointTask:
         """What the newest views of some agents show, as `sense` finds it for those in one room."""
         if len(self._rooms) == 1:
             return sense(self._rooms[0], rows)
-        whole = Shown(*np.empty((2, len(rows))), np.empty(len(rows), dtype=np.int64))
+        least, mean = np.empty((2, len(rows)))
+        whole = Shown(least, mean, np.empty(len(rows), dtype=np.int64))
         for room, chosen in self._by_room(rows):
             part = sense(room, rows[chosen])
             whole.least[chosen], whole.mean[chosen], whole.new_cells[chosen] = part.least, part.mean, part.new_cells
@@ -303,21 +294,17 @@ class ViewpointTask:
         return self.kind(agents)
 
     def _scenes(self, rows: Rows) -> list[SceneAgents]:
-        return [
-            SceneAgents(
-                simulator=room.simulator,
-                chosen=chosen,
-                views=self._views(rows[chosen]),
-                _rows=rows[chosen],
-                _first_seen=self._first_seen,
-                _floor=room.floor,
-                _surface=room.surface,
-            )
-            for room, chosen in self._by_room(rows)
-        ]
+        scenes = []
+        for room, chosen in self._by_room(rows):
+            there = rows[chosen]
+            views = self._views(there)
+            scenes.append(SceneAgents(room.simulator, chosen, views, there, self._first_seen, room.floor, room.surface))
+        return scenes
 
-    def _record(self, parts: dict[str, NDArray[np.float64]], **columns: NDArray[np.generic]) -> None:
+    def _record(self, actions: NDArray, reward: NDArray, parts: dict[str, NDArray], facts: StepFacts) -> None:
         now = (self._everyone, self.steps - 1)
+        columns = {"action": actions, "reward": reward, "coverage": facts.coverage}
+        columns |= {"collided": facts.collided, "redundant": facts.redundant}
         for name, values in columns.items():
             self._log[name][now] = values
         for name in dict.fromkeys([*self._parts, *parts]):
