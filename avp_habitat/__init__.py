@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from avp_habitat.navigation.area import NavigableArea
     from avp_habitat.policies.registry import make_policy
     from avp_habitat.poses import pixel_directions
-    from avp_habitat.recording import RecordRollout
+    from avp_habitat.rollout.capture import RecordRollout
     from avp_habitat.rollout.format import Rollout, read_rollout
     from avp_habitat.scenes.location import Frame
     from avp_habitat.sight.rules import visible_in_depth
@@ -56,41 +56,34 @@ __all__ = [
     "visible_in_depth",
 ]
 
-_HOME = {
-    "AVPEnv": "task.env",
-    "AgentView": "task.agent_view",
-    "Agents": "task.observations",
-    "Collect": "collect",
-    "Figure": "metrics",
-    "Frame": "scenes.location",
-    "Frames": "simulators.base",
-    "NavigableArea": "navigation.area",
-    "RecordRollout": "recording",
-    "RewardConstants": "task.rewards",
-    "Rollout": "rollout.format",
-    "Simulator": "simulators.base",
-    "SingleRays": "simulators.base",
-    "StepFacts": "task.rewards",
-    "TaskSettings": "task.settings",
-    "Trajectory": "task.trajectory",
-    "agent_views": "task.agent_view",
-    "make_policy": "policies.registry",
-    "make_simulator": "simulators.registry",
-    "metric": "metrics",
-    "numbers": "task.observations",
-    "pixel_directions": "poses",
-    "read_rollout": "rollout.format",
-    "reward": "task.rewards",
-    "visible_in_depth": "sight.rules",
+_HOMES = {
+    "collect": {"Collect"},
+    "metrics": {"Figure", "metric"},
+    "navigation.area": {"NavigableArea"},
+    "policies.registry": {"make_policy"},
+    "poses": {"pixel_directions"},
+    "rollout.capture": {"RecordRollout"},
+    "rollout.format": {"Rollout", "read_rollout"},
+    "scenes.location": {"Frame"},
+    "sight.rules": {"visible_in_depth"},
+    "simulators.base": {"Frames", "Simulator", "SingleRays"},
+    "simulators.registry": {"make_simulator"},
+    "task.agent_view": {"AgentView", "agent_views"},
+    "task.env": {"AVPEnv"},
+    "task.observations": {"Agents", "numbers"},
+    "task.rewards": {"RewardConstants", "StepFacts", "reward"},
+    "task.settings": {"TaskSettings"},
+    "task.trajectory": {"Trajectory"},
 }
 ENV_ID = "AVP-v0"
 
 if ENV_ID not in gymnasium.registry:
     # The task counts its own budget, so gymnasium's TimeLimit is not used.
-    gymnasium.register(ENV_ID, entry_point="avp_habitat.recording:make_env")
+    gymnasium.register(ENV_ID, entry_point="avp_habitat.rollout.capture:make_env")
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{home}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -15,14 +15,7 @@ from avp_habitat.errors import RolloutError
 from avp_habitat.files import check_writable
 from avp_habitat.metrics import METRICS_HELP
 from avp_habitat.plugins import name_of
-from avp_habitat.policies.registry import (
-    POLICIES_HELP,
-    TRUSTED,
-    check_policy,
-    described,
-    make_policy_env,
-    steps_of,
-)
+from avp_habitat.policies.registry import POLICIES_HELP, TRUSTED, check_policy, described, make_policy_env, steps_of
 from avp_habitat.poses import Intrinsics
 from avp_habitat.provenance import nerfacto_line
 from avp_habitat.ranges import Range, hold_ranges
@@ -78,23 +71,13 @@ class Collect:
         """Hold the ranges."""
         hold_ranges(self)
 
-    @property
-    def camera(self) -> Intrinsics:
-        """Of the pictures that are written."""
-        return Intrinsics.from_hfov(self.width, self.height, hfov_deg=TaskSettings.hfov_deg)
-
 
 def _settings(options: Collect) -> TaskSettings:
     return TaskSettings(reward=options.reward, budget=options.budget, metrics=options.metrics)
 
 
 def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: int = VIEWS) -> dict[str, Any]:
-    """Collect one rollout.
-
-    Args:
-        options: of the command.
-        settings: of the task, in place of those that the options give.
-        heldout: number of held-out views.
+    """Collect one rollout, by other settings of the task and so many held-out views where these are given.
 
     Returns:
         The metrics written to `rollout.json`, which are those of `trajectory.episode_metrics`, and visibility.
@@ -105,7 +88,8 @@ def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: 
     """
     check_policy(options.policy)
     settings = settings or _settings(options)
-    with RolloutWriter(options.out, options.camera) as writer:
+    camera = Intrinsics.from_hfov(options.width, options.height, hfov_deg=TaskSettings.hfov_deg)
+    with RolloutWriter(options.out, camera) as writer:
         simulator = open_simulator(options.simulator, options.scene)
         env, policy = make_policy_env(
             options.policy,

@@ -22,12 +22,8 @@ def parse(options: type[Options], argv: Sequence[str], *, prog: str | None = Non
     """Read a command line into a dataclass: tyro makes `--flag` from the field `flag`, and `--help` from docstrings.
 
     A field without a default is required, `tyro.conf.Positional[Path]` has no flag, a nested dataclass gives its
-    fields as they are, without a prefix. The class's docstring is the command's description.
-
-    Args:
-        options: the dataclass. What its `__post_init__` refuses by "field: …" is told as "--field: …".
-        argv: the words of the command line.
-        prog: the program's name in the help; that of the running module when omitted.
+    fields as they are, without a prefix. The class's docstring is the command's description. What its `__post_init__`
+    refuses by "field: …" is told as "--field: …".
 
     Raises:
         UsageError: the words do not fit, in one line.
@@ -74,15 +70,10 @@ def _interrupt(signum: int, _frame: object) -> None:
 
 
 def run(main: Callable[[Any], None], argv: Sequence[str] | None = None) -> int:
-    """Run a command and turn its outcome into an exit code.
+    """Run a command and turn its outcome into an exit code: 0, or 1 (failure), 2 (usage), 130 (interrupted).
 
-    Args:
-        main: takes the options that its annotation names (`parse`), or else the list of words.
-        argv: the arguments; the process's own when omitted.
-
-    Returns:
-        0, or 1 (failure), 2 (usage), 130 (interrupted). A SIGTERM ends the command like Ctrl-C, so that
-        temporary folders are removed.
+    `main` takes the options that its annotation names (`parse`), or else the list of words. A SIGTERM ends the command
+    like Ctrl-C, so that temporary folders are removed.
     """
     words = sys.argv[1:] if argv is None else argv
     options = next(iter(get_type_hints(main).values()), None)
@@ -129,11 +120,9 @@ class _Lines:
 
 
 def progress(work: Iterable[Any] | None = None, **options: Any) -> tqdm:
-    """Tqdm's bar; without a terminal it prints a line at the start, every ten seconds and at the end.
+    """Tqdm's bar, whose options are at least `desc` and `unit`, and `total` where `work` has no length.
 
-    Args:
-        work: to go through; None to call `update`.
-        **options: tqdm's, `desc` and `unit` at least; `total` where `work` has no length.
+    Without a terminal it prints a line at the start, every ten seconds and at the end.
     """
     if sys.stderr.isatty():
         return tqdm(work, **options)

@@ -28,31 +28,30 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         except RuntimeError as error:
             if "cannot cache function" not in str(error):
                 raise
-        again: dict[str, Any] = {**options, "cache": _elsewhere() is not None}
+        again: dict[str, Any] = {**options, "cache": _elsewhere()}
         return numba.njit(**again)(function)
 
     return compiled
 
 
 @cache
-def _elsewhere() -> Path | None:
-    """The folder that Numba uses from now on, in this program and in those that it starts; None when there is none."""
-    folder = _own_folder()
-    if folder is None:
+def _elsewhere() -> bool:
+    """Let Numba use a folder for temporary files, also in programs that this one starts; whether there is such one."""
+    folder = Path(tempfile.gettempdir()) / f"avp-numba-{os.getuid()}"
+    if not _is_own(folder):
         _LOG.warning("compiled code cannot be kept, so that each start takes longer; name a folder in %s", VARIABLE)
-        return None
+        return False
     _LOG.warning("compiled code is kept in %s; name a folder that lasts in %s", folder, VARIABLE)
     os.environ[VARIABLE] = numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
-    return folder
+    return True
 
 
-def _own_folder() -> Path | None:
-    """A folder for temporary files in which nobody else can write: what lies there is run."""
+def _is_own(folder: Path) -> bool:
+    """Make a folder in which nobody else can write, because what lies there is run."""
     try:
-        folder = Path(tempfile.gettempdir()) / f"avp-numba-{os.getuid()}"
         folder.mkdir(mode=0o700, exist_ok=True)
         found = folder.lstat()
     except OSError:
-        return None
+        return False
     private = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
-    return folder if private and os.access(folder, os.W_OK) else None
+    return private and os.access(folder, os.W_OK)

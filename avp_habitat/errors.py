@@ -33,13 +33,7 @@ class PolicyError(AVPError):
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UsageError:
-    """Error for a name that is not in a list, with the nearest known name.
-
-    Args:
-        kind: what is named, for example `"reward"`.
-        name: what the user wrote.
-        known: every accepted name.
-    """
+    """Error for a name of some kind of thing, such as `"reward"`, that is not known, with the nearest known name."""
     names = sorted(known)
     return UsageError(f"unknown {kind} {name!r}: expected one of {', '.join(names)}{did_you_mean(name, names)}")
 

@@ -15,7 +15,6 @@ from avp_habitat.errors import UsageError
 
 Float = NDArray[np.floating]
 
-
 ALIKE_DEG = 60.0
 """A frame sees a surface as the held-out view does when its ray is turned by no more than this, degrees."""
 ALIKE_DISTANCE = 2.0
@@ -62,32 +61,20 @@ _ALIKE = f"that, within {ALIKE_DEG:g} degrees of the held-out ray and at most {A
 _PARALLAX = f"that, along two rays at least {PARALLAX_DEG:g} degrees apart, which fixes the depth"
 _SEEN = "share of the held-out views' pixels whose surface a captured picture shows"
 _SHARE = "share of the navigable floor that some picture shows"
+_NEAREST = "mean distance from each camera to the nearest other one, small where places repeat"
+_REPEATED = "like an earlier one in place and direction"
 _ALL = (
     Figure("coverage", "coverage", "%", 100, better="higher", meaning=_SHARE),
     Figure("coverage_area", "coverage, mean over views", "%", 100, better="higher"),
     Figure("views", "views", better="lower", meaning="pictures taken, one for each step"),
     Figure("stopped", "stop", "%", 100, meaning="the policy itself ended the episode, with enough coverage"),
     Figure("cpv", "CpV", "%/view", 1, 2, "higher", "coverage per view, mean coverage over mean number of views"),
-    Figure(
-        "annd_m",
-        "ANND",
-        "m",
-        1,
-        3,
-        meaning="mean distance from each camera to the nearest other one, small where places repeat",
-    ),
+    Figure("annd_m", "ANND", "m", 1, 3, meaning=_NEAREST),
     Figure("ei", "EI", "%/view", 100, 2, "higher", "efficiency index, coverage over the number of pictures"),
     Figure("path_length_m", "path length", "m", 1, 2, meaning="metres walked"),
     Figure("collisions", "collisions", better="lower", meaning="forward moves that were blocked"),
-    Figure("redundant_views", "redundant views", better="lower", meaning="like an earlier one in place and direction"),
-    Figure(
-        "redundant_share",
-        "redundant views",
-        "%",
-        100,
-        better="lower",
-        meaning="like an earlier one in place and direction",
-    ),
+    Figure("redundant_views", "redundant views", better="lower", meaning=_REPEATED),
+    Figure("redundant_share", "redundant views", "%", 100, better="lower", meaning=_REPEATED),
     Figure("surface", "surface", "%", 100, better="higher", meaning="how well the scene's surface was seen"),
     _visibility("", "visibility", _SEEN),
     _visibility("_2_frames", "2 frames", "that, by at least two pictures"),
@@ -108,11 +95,7 @@ TERMS = {figure.title: figure.meaning for figure in _ALL if figure.meaning} | {
 
 
 def explained(*terms: str) -> str:
-    """One line that says what terms mean.
-
-    Args:
-        *terms: of `TERMS`.
-    """
+    """One line that says what some of `TERMS` mean."""
     return "; ".join(f"{term}: {TERMS[term]}" for term in terms)
 
 
@@ -124,17 +107,15 @@ MetricFunction = Callable[[Any], float]
 
 
 def metric(figure: Figure, *, of: Of = "episode") -> Callable[[MetricFunction], MetricFunction]:
-    """Decorator of a function that computes one more figure.
+    """Decorator of a function that computes one more figure, whose name may not be one of `FIGURES`.
 
-    Args:
-        figure: how it is called and shown; its name may not be one of `FIGURES`.
-        of: what the function takes: the `Trajectory` of a finished episode, or a `Rollout` with its pictures.
+    It takes the `Trajectory` of a finished episode, or a `Rollout` with its pictures.
     """
     return plugins.declares(figure=figure, of=of)
 
 
 def find_metrics(chosen: Sequence[str | MetricFunction]) -> list[Any]:
-    """The functions behind the names of metrics: `module:function`, or what another distribution registers.
+    """The functions behind the names of metrics.
 
     Raises:
         UsageError: there is no such metric, it declares no figure, or two figures have one name.
@@ -172,9 +153,6 @@ def figures(chosen: Sequence[str | MetricFunction] = ()) -> dict[str, Figure]:
     """All figures by name: the suite's, those that other distributions register, and those of the chosen metrics.
 
     A registered metric that cannot be imported is left out: what it measured is then shown by its key.
-
-    Args:
-        chosen: metrics, for those that are named by `module:function` or given as they are.
     """
     found = []
     for name in plugins.names("avp.metrics", ()):
@@ -189,26 +167,14 @@ def figure_of(name: str) -> Figure:
 
 
 def coverage(observed: NDArray[np.bool_], navigable: NDArray[np.bool_]) -> float:
-    """Share of the navigable cells that were observed (C, Eq. 17).
-
-    Args:
-        observed: cells seen in a captured frame, any shape.
-        navigable: cells where an agent can stand, same shape, at least one.
-
-    Returns:
-        Within [0, 1].
-    """
+    """Share of the navigable cells, at least one, that were observed (C, Eq. 17); both arrays have the same shape."""
     return float(np.sum(observed & navigable) / np.sum(navigable))
 
 
 def nearest_neighbour_distance(positions: Float) -> float:
-    """Mean distance from each camera to its nearest other camera (ANND, Eq. 18).
+    """Mean distance in metres from each of `(n, 3)` camera centres to its nearest other one (ANND, Eq. 18).
 
-    Args:
-        positions: `(n, 3)` camera centres in metres, any frame.
-
-    Returns:
-        Metres; 0.0 for fewer than two cameras.
+    0.0 for fewer than two cameras.
     """
     positions = np.asarray(positions, dtype=np.float64)
     if len(positions) < 2:
@@ -219,24 +185,14 @@ def nearest_neighbour_distance(positions: Float) -> float:
 
 
 def efficiency_index(coverage: float, images: int) -> float:
-    """Coverage per captured image (EI = C / N_images); 0.0 without images.
-
-    Args:
-        coverage: within [0, 1].
-        images: number of captured frames.
-    """
+    """Coverage, within [0, 1], per captured image (EI = C / N_images); 0.0 without images."""
     return coverage / images if images else 0.0
 
 
 def coverage_per_view(coverages: Float, lengths: Float) -> float:
-    """Percent of coverage per step (CpV = 100 · mean C / mean episode length).
+    """Percent of coverage per step (CpV = 100 · mean C / mean episode length) of n episodes; 0.0 without any.
 
-    Args:
-        coverages: `(n,)` final coverage of n episodes, within [0, 1].
-        lengths: `(n,)` their lengths in steps.
-
-    Returns:
-        Percent per step; 0.0 without episodes.
+    Their final coverages are `(n,)` within [0, 1], their lengths `(n,)` steps.
     """
     return float(100 * np.mean(coverages) / np.mean(lengths)) if len(lengths) else 0.0
 
@@ -251,14 +207,9 @@ CONFIDENCE = 0.95
 
 
 def mean_and_half_width(values: ArrayLike, *, confidence: float = CONFIDENCE) -> tuple[NDArray, NDArray]:
-    """Mean over episodes or runs, and half the width of its confidence interval (Student's t, n - 1 degrees).
+    """Mean of `(n, ...)` values over n episodes or runs, and half the width of its confidence interval, `(...)` each.
 
-    Args:
-        values: `(n, ...)` a figure of each of n episodes, n at least 1.
-        confidence: within (0, 1).
-
-    Returns:
-        `(...)` each; the half width is nan for one episode, of whose spread nothing is known.
+    By Student's t with n - 1 degrees; nan for one episode, of whose spread nothing is known.
     """
     from scipy import stats
 

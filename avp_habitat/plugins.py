@@ -58,8 +58,7 @@ def declares(**facts: Any) -> Callable[[Function], Function]:
     """Decorator: what a function declares about itself, as its attributes, which a class says in its body."""
 
     def declared(function: Function) -> Function:
-        for name, value in facts.items():
-            setattr(function, name, value)
+        vars(function).update(facts)
         return function
 
     return declared
@@ -79,12 +78,8 @@ def name_of(thing: Any) -> str:
 
 
 @cache
-def _all_registered() -> Any:
-    return entry_points()
-
-
 def _registered(group: str) -> Iterable[EntryPoint]:
-    return _all_registered().select(group=group)
+    return entry_points(group=group)
 
 
 def _owner(point: EntryPoint) -> str:

@@ -56,15 +56,12 @@ class Intrinsics:
 
 
 def camera_to_world(position: Float, *, yaw: Float, pitch: Float) -> NDArray[np.float64]:
-    """Poses of upright cameras (no roll), habitat axes.
+    """`(n, 4, 4)` poses of upright cameras (no roll), habitat axes.
 
     Args:
         position: `(n, 3)` camera centres, metres, world frame.
         yaw: `(n,)` radians, left positive.
         pitch: `(n,)` radians, up positive.
-
-    Returns:
-        `(n, 4, 4)` float64.
     """
     position = np.asarray(position, dtype=np.float64)
     cos_y, sin_y = np.cos(yaw), np.sin(yaw)
@@ -116,13 +113,9 @@ def z_up_to_y_up(pose: Float) -> Float:
 
 
 def axes_to_world(up: tuple[float, float, float], front: tuple[float, float, float]) -> NDArray[np.float64]:
-    """The `(3, 3)` rotation from a file with these axes to the world: up becomes +Y, front -Z.
+    """The `(3, 3)` rotation from a file with these axes, unit vectors at right angles, to the world.
 
-    It is the frame that Habitat-Sim builds of a stage config's `up` and `front` (a rotation only).
-
-    Args:
-        up: unit vector in the file's coordinates.
-        front: unit vector in the file's coordinates, at right angles to `up`.
+    Up becomes +Y, front -Z: the frame that Habitat-Sim builds of a stage config's `up` and `front`.
     """
     return np.array([np.cross(front, up), up, np.negative(front)], dtype=np.float64)
 
@@ -134,20 +127,11 @@ def pixel_directions(intrinsics: Intrinsics) -> Float:
     """
     u = (np.arange(intrinsics.width) + 0.5 - intrinsics.cx) / intrinsics.fx
     v = (np.arange(intrinsics.height) + 0.5 - intrinsics.cy) / intrinsics.fy
-    directions = np.empty((intrinsics.height, intrinsics.width, 3))
-    directions[..., 0] = u[None, :]
-    directions[..., 1] = -v[:, None]
-    directions[..., 2] = -1.0
-    return directions
+    return np.stack(np.broadcast_arrays(u[None, :], -v[:, None], -1.0), axis=-1)
 
 
 def project(points: Float, pose: Float, intrinsics: Intrinsics) -> tuple[Float, Float]:
-    """Project world points into cameras.
-
-    Args:
-        points: `(m, 3)` metres, world frame.
-        pose: `(n, 4, 4)` camera_to_world, habitat axes.
-        intrinsics: of all cameras.
+    """Project `(m, 3)` world points in metres into the cameras of `(n, 4, 4)` habitat poses.
 
     Returns:
         `(n, m, 2)` pixel coordinates (x right, y down, pixel centres at +0.5; meaningless behind the camera) and
@@ -164,10 +148,7 @@ def project(points: Float, pose: Float, intrinsics: Intrinsics) -> tuple[Float, 
 def unproject(depth: Float, pose: Float, intrinsics: Intrinsics) -> Float:
     """World points, `(height, width, 3)` metres, of a `(height, width)` planar depth image in metres.
 
-    Args:
-        depth: planar depth in metres.
-        pose: `(4, 4)` camera_to_world, habitat axes.
-        intrinsics: of the camera.
+    The pose is a `(4, 4)` camera_to_world, habitat axes.
     """
     local = pixel_directions(intrinsics) * np.asarray(depth, dtype=np.float64)[..., None]
     return local @ pose[:3, :3].T + pose[:3, 3]
@@ -176,9 +157,7 @@ def unproject(depth: Float, pose: Float, intrinsics: Intrinsics) -> Float:
 def rigidity_fault(pose: Float, tolerance: float = 1e-4) -> str | None:
     """Why a matrix is not a rigid camera_to_world, in words, or None when it is one.
 
-    Args:
-        pose: the candidate, expected `(4, 4)`.
-        tolerance: largest accepted deviation of R Rᵀ from the identity and of the last row.
+    The tolerance is the largest accepted deviation of R Rᵀ from the identity and of the last row.
     """
     pose = np.asarray(pose)
     if pose.shape != (4, 4):

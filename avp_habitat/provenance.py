@@ -7,30 +7,17 @@ from collections.abc import Iterable, Mapping
 from importlib import metadata
 from typing import Any
 
-PACKAGES = (
-    "avp-suite",
-    "stable-baselines3",
-    "nerfstudio",
-    "torch",
-    "gymnasium",
-    "numpy",
-    "open3d",
-    "mlflow",
-    "rerun-sdk",
-)
+_HOSTS = ("stable-baselines3", "nerfstudio", "torch", "gymnasium", "numpy", "open3d", "mlflow", "rerun-sdk")
+PACKAGES = ("avp-suite", *_HOSTS)
 """The suite, and what its results depend on most."""
 
 
 def git_commit() -> str | None:
     """The commit checked out in the current folder; None outside a repository or without git."""
-    command = ["git", "rev-parse", "HEAD"]
     try:
-        answer = subprocess.run(
-            command, capture_output=True, text=True, timeout=10, check=True, stdin=subprocess.DEVNULL
-        )
+        return subprocess.check_output(["git", "rev-parse", "HEAD"], text=True, stderr=subprocess.DEVNULL).strip()
     except (OSError, subprocess.SubprocessError):
         return None
-    return answer.stdout.strip()
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -64,11 +51,8 @@ WITHOUT_GPU = "--machine.device-type cpu --pipeline.model.implementation torch -
 
 def has_cuda() -> bool:
     """Whether torch, as it is installed, would find a CUDA device: asks NVIDIA's driver, in milliseconds."""
-    try:
-        if metadata.version("torch").endswith("+cpu"):
-            return False
-    except metadata.PackageNotFoundError:
-        pass
+    if (version_of("torch") or "").endswith("+cpu"):
+        return False
     try:
         driver = ctypes.CDLL("libcuda.so.1")
         count = ctypes.c_int(0)
@@ -78,10 +62,6 @@ def has_cuda() -> bool:
 
 
 def nerfacto_line(data: str) -> str:
-    """The command line that trains plain nerfacto on a rollout on this machine.
-
-    Args:
-        data: the rollout's folder, quoted for a shell.
-    """
+    """The command line that trains plain nerfacto on a rollout, quoted for a shell, on this machine."""
     options = "" if has_cuda() else f"{WITHOUT_GPU} "
     return f"ns-train nerfacto {options}avp-data --data {data}"

@@ -13,19 +13,14 @@ class Range:
     """Numbers from `least` to `most`, both allowed: `width: Annotated[int, Range(1, 4096)]`."""
 
     least: float
-    """Least one."""
     most: float
-    """Greatest one."""
 
 
 def hold_ranges(settings: Any) -> None:
-    """Hold every number of a dataclass to the range of its type, and every `Literal` to its values.
+    """Hold every number of a dataclass, frozen or not, to the range of its type, and every `Literal` to its values.
 
     Whole numbers of any kind (160.0, numpy's) become `int` and others `float`, so that settings look alike
     however they were given.
-
-    Args:
-        settings: a dataclass, frozen or not, fresh from its constructor.
 
     Raises:
         UsageError: a value is no such number, is NaN or infinite, or lies outside; the text names the field.
@@ -43,13 +38,7 @@ def hold_ranges(settings: Any) -> None:
 
 
 def number(name: str, value: Any, kind: type, limits: Range) -> Any:
-    """A number as `kind` (`int` or `float`).
-
-    Args:
-        name: of the option, for the error.
-        value: what the user gave.
-        kind: what it becomes.
-        limits: of its range.
+    """The number that a user gave for an option as `kind` (`int` or `float`).
 
     Raises:
         UsageError: it is no such number.

@@ -14,16 +14,7 @@ from avp_habitat.scenes.location import HELP, UP_HELP
 
 
 def save_navmesh(scene: str | Path, out: Path, *, gpu: int | None = None, up: str | None = None) -> float:
-    """Compute a scene's NavMesh for the task's agent and write it.
-
-    Args:
-        scene: as for `avp_habitat.scenes.location.locate`.
-        out: the file; appears only when it is complete.
-        gpu: CUDA device for Habitat-Sim, see `HabitatSimulator`.
-        up: axis of a mesh file that points up, `y` or `z`.
-
-    Returns:
-        The navigable area in square metres.
+    """Compute a scene's NavMesh for the task's agent, write it whole, and give the navigable area in square metres.
 
     Raises:
         UsageError: the name does not end in `.navmesh`, or the file exists.
@@ -33,8 +24,6 @@ def save_navmesh(scene: str | Path, out: Path, *, gpu: int | None = None, up: st
     if out.suffix != ".navmesh":
         raise UsageError(f"{out}: expected a name that ends in .navmesh")
     check_new(out)
-    if not out.parent.is_dir():
-        raise UsageError(f"{out}: there is no folder {out.parent}")
     from avp_habitat.simulators.habitat import HabitatSimulator
 
     simulator = HabitatSimulator(scene, gpu=gpu, up=up)

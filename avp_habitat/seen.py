@@ -1,8 +1,9 @@
 """`python -m avp_habitat.seen`: how much of what a rollout's held-out views show its captured frames have seen."""
 
 import json
+import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +16,6 @@ from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.metrics import FIGURES, METRICS_HELP, explained, figure_of, find_metrics, measured
 from avp_habitat.rollout.format import name_of, read_rollout
 from avp_habitat.rollout.seen import visibility_of
-from avp_habitat.sight.visibility import Visibility
 from avp_habitat.tables import table
 
 _ABOUT = ("rollout", "scene", "policy", "views")
@@ -23,38 +23,10 @@ _SHARES = ("coverage", *(name for name in FIGURES if name.startswith("visibility
 _MEANING = "In percent. " + explained(*(FIGURES[name].title for name in _SHARES))
 
 
-@dataclass(frozen=True)
-class Report:
-    """What was found of one rollout."""
+def report_on(folder: Path, *, stride: int | None = None, metrics: Sequence[str] = ()) -> dict[str, Any]:
+    """What a rollout's frames have seen of its held-out views, as JSON: shares within [0, 1], None where unknown.
 
-    about: dict[str, Any]
-    """Folder, scene, policy, views; coverage as the rollout says it, None where it does not."""
-    found: Visibility
-    """Of its held-out pixels."""
-    further: dict[str, float]
-    """What the chosen metrics of the rollout give, by the figures' names."""
-
-    def as_json(self) -> dict[str, Any]:
-        """For programs: shares within [0, 1], also per held-out view and after each frame."""
-        per_view = [None if share != share else share for share in self.found.per_view().tolist()]
-        further = {"pixels": len(self.found.view), "per_view": per_view, "curve": self.found.curve().tolist()}
-        return self.about | self.found.figures() | self.further | further
-
-    def as_row(self) -> list[str]:
-        """For people: shares in percent."""
-        values = self.about | self.found.figures()
-        shares = ["" if values[name] is None else FIGURES[name].text(values[name]) for name in _SHARES]
-        own = [figure_of(name).text(value) for name, value in self.further.items()]
-        return [str(values[name]) for name in _ABOUT] + shares + own
-
-
-def report_on(folder: Path, *, stride: int | None = None, metrics: Sequence[str] = ()) -> Report:
-    """Read a rollout and measure what its frames have seen of its held-out views.
-
-    Args:
-        folder: of the rollout.
-        stride: as `visibility_of` takes it.
-        metrics: of rollouts, as `metrics.find_metrics` takes them.
+    The stride is that of `visibility_of`, the metrics are those of `metrics.find_metrics`.
 
     Raises:
         UsageError: no such metric.
@@ -68,14 +40,24 @@ def report_on(folder: Path, *, stride: int | None = None, metrics: Sequence[str]
             "without any depth; collect it with held-out views"
         )
     coverage = rollout.meta.get("metrics", {}).get("coverage")
-    about = {
+    return {
         "rollout": str(folder),
         "scene": name_of(rollout.meta, "scene"),
         "policy": name_of(rollout.meta, "policy"),
         "views": len(rollout.frames),
         "coverage": None if coverage is None else float(coverage),
+        **found.figures(),
+        **measured(metrics, "rollout", rollout),
+        "pixels": len(found.view),
+        "per_view": [None if math.isnan(share) else share for share in found.per_view().tolist()],
+        "curve": found.curve().tolist(),
     }
-    return Report(about, found, measured(metrics, "rollout", rollout))
+
+
+def as_row(report: dict[str, Any], further: Iterable[str] = ()) -> list[str]:
+    """What `report_on` gave in words and in percent, then the figures of further metrics."""
+    shown = ["" if report[name] is None else figure_of(name).text(report[name]) for name in (*_SHARES, *further)]
+    return [*(str(report[name]) for name in _ABOUT), *shown]
 
 
 @dataclass(frozen=True)
@@ -109,11 +91,12 @@ def main(options: Seen) -> None:
     waiting = progress(options.rollouts, desc="reading", unit="rollout") if several else options.rollouts
     reports = [report_on(folder, stride=options.every, metrics=options.metrics) for folder in waiting]
     if options.json:
-        print(json.dumps([report.as_json() for report in reports], indent=2, allow_nan=False))
+        print(json.dumps(reports, indent=2, allow_nan=False))
         return
-    further = [figure_of(name).heading for name in reports[0].further]
-    head = [*_ABOUT, *(FIGURES[name].title for name in _SHARES), *further]
-    print(table(head, [report.as_row() for report in reports], words=3, markdown=False))
+    further = [function.figure for function in find_metrics(options.metrics) if function.of == "rollout"]
+    head = [*_ABOUT, *(FIGURES[name].title for name in _SHARES), *(figure.heading for figure in further)]
+    rows = [as_row(report, [figure.name for figure in further]) for report in reports]
+    print(table(head, rows, words=3, markdown=False))
     print(f"\n{_MEANING}")
 
 

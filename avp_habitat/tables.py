@@ -6,17 +6,13 @@ from collections.abc import Sequence
 def table(
     head: Sequence[str], rows: Sequence[Sequence[str]], *, words: int | None = None, markdown: bool = True
 ) -> str:
-    """Rows below their head, each column as wide as its longest cell.
+    """Rows below their head, each column as wide as its longest cell; no line feed after the last one.
 
     Args:
         head: titles of the columns.
         rows: one text for each column.
-        words: how many columns, from the left, hold words and stand left; the others hold numbers and stand right.
-            None: all stand left.
+        words: how many columns, from the left, stand left; the others hold numbers and stand right. None: all.
         markdown: with bars and a rule below the head; otherwise two spaces between columns.
-
-    Returns:
-        The lines, without a line feed after the last one.
     """
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     words = len(widths) if words is None else words

@@ -17,7 +17,7 @@ _LATE = (
     "rerun",
     "avp_habitat.rollout.drawing",
     "avp_habitat.task.motion",
-    "avp_habitat.task.lookup",
+    "avp_habitat.task.cast",
     "avp_habitat.navigation.build",
     "avp_habitat.scenes.loader",
 )

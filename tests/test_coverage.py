@@ -81,7 +81,7 @@ def test_cells_passed_over_equal_dense_sampling_along_every_ray():
     index[area.mask] = np.arange(len(CELLS))
     depth = SIMULATOR.render(pose, camera, rgb=False).depth
     depth[0, 0, 0] = 0.0
-    over = cells_passed_over(pose, camera, depth, index, area.origin, cell_m=0.1, cells=len(CELLS), max_range_m=4.0)
+    over = cells_passed_over(pose, camera, depth, area, max_range_m=4.0)
     for agent in range(3):
         sampled = np.zeros(len(CELLS), dtype=bool)
         local = poses.pixel_directions(camera)

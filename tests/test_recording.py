@@ -9,7 +9,7 @@ from avp_habitat import command
 from avp_habitat.collect import main as collect
 from avp_habitat.errors import UsageError
 from avp_habitat.policies.reactive import RandomPolicy
-from avp_habitat.recording import RecordRollout
+from avp_habitat.rollout.capture import RecordRollout
 from avp_habitat.rollout.format import read_rollout
 from avp_habitat.task.env import AVPEnv
 

@@ -8,10 +8,12 @@ import signal
 import subprocess
 import sys
 import sysconfig
+import time
 import tomllib
-from dataclasses import dataclass
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 from packaging.requirements import Requirement
@@ -28,8 +30,11 @@ _AGAIN = "pip install -e . in the checkout, or reinstall the wheel"
 _NOT_MINE = 66  # Rerun's contract for the programs that it offers every opened path to
 
 
-@dataclass(frozen=True)
-class Finding:
+# Some hosts leave threads behind that would keep the process, and drivers may crash while Python is taken down.
+_PROBE = "import json, os, sys; from {} import {} as f; print(json.dumps(f(*sys.argv[1:])), flush=True); os._exit(0)"
+
+
+class Finding(NamedTuple):
     """One line of the report: how it is, what was looked at, what was found and what to do."""
 
     mark: str
@@ -55,11 +60,10 @@ class Plug(NamedTuple):
 def manifest_path() -> Path:
     """Path of `plugins.toml`: beside the packages in a checkout, else where the wheel put it."""
     folders = Path(__file__).resolve().parents
-    candidates = [folders[2] / MANIFEST, *(folder / "share" / DISTRIBUTION / MANIFEST for folder in folders)]
-    for path in candidates:
+    for path in (folders[2] / MANIFEST, *(folder / "share" / DISTRIBUTION / MANIFEST for folder in folders)):
         if path.is_file():
             return path
-    raise AVPError(f"{candidates[0]}: the manifest of plugs is missing; reinstall the suite")
+    raise AVPError(f"{folders[2] / MANIFEST}: the manifest of plugs is missing; reinstall the suite")
 
 
 def read_manifest() -> list[Plug]:
@@ -114,12 +118,16 @@ def _required(requirement: Requirement) -> Finding:
     return Finding(OK, requirement.name, f"{found} (needs {asked})")
 
 
-def ask(command: list[str], *, time_limit_s: float, question: Any = None) -> tuple[Any, str | None]:
-    """The JSON value that a Python program with this input prints as its last line, or None and why it did not."""
+def probe(look: Callable[..., Any], *arguments: str) -> list[str]:
+    """Words for Python to call a function in a process of its own, because it may crash, hang or print."""
+    return ["-c", _PROBE.format(look.__module__, look.__name__), *arguments]
+
+
+def ask(words: list[str], *, time_limit_s: float) -> tuple[Any, str | None]:
+    """The JSON value that Python with these words prints as its last line, or None and why it did not."""
     how: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace", "env": {**os.environ, **_SILENT}}
-    words = [sys.executable, *command]
     try:
-        done = subprocess.run(words, input=json.dumps(question), timeout=time_limit_s, check=False, **how)
+        done = subprocess.run([sys.executable, *words], timeout=time_limit_s, check=False, **how)
     except subprocess.TimeoutExpired:
         return None, f"gave no answer within {time_limit_s:.0f} s"
     said, told = (["", *filter(None, map(str.strip, text.splitlines()))][-1] for text in (done.stdout, done.stderr))
@@ -143,8 +151,7 @@ def check_host(host: str, plugs: list[Plug]) -> list[Finding]:
         return [Finding(ABSENT, f"plug {plug.name}", f"{host} is not installed; {get}") for plug in plugs]
     if host == "rerun":
         return [_program(plug, version) for plug in plugs]
-    words = ["-m", "avp_habitat.doctor.probe", "host", host]
-    reasons, failure = ask(words, time_limit_s=90.0, question=[plug._asdict() for plug in plugs])
+    reasons, failure = ask(probe(reasons_of, json.dumps(plugs)), time_limit_s=90.0)
     if failure is not None:
         text = f"{host} {version} cannot be asked: {failure}; {get} in a new environment"
         return [Finding(BROKEN, f"plug {plug.name}", text) for plug in plugs]
@@ -177,3 +184,65 @@ def _program(plug: Plug, version: str) -> Finding:
         text = f"{found} ended with exit code {code} on a path that is not its own, not {_NOT_MINE}; {_AGAIN}"
         return Finding(BROKEN, subject, text)
     return Finding(OK, subject, f"{found}, for {plug.host} {version}")
+
+
+_SEES: dict[str, Callable[[Plug], Any]] = {
+    "registration on import": lambda plug: resolve_name("gymnasium:spec")(plug.name),
+    "wrapper": lambda plug: _is_a(plug, "gymnasium:Wrapper"),
+    "callback": lambda plug: _is_a(plug, "stable_baselines3.common.callbacks:BaseCallback"),
+    "VecEnv": lambda plug: _is_a(plug, "stable_baselines3.common.vec_env:VecEnv"),
+    "--conf-file": lambda plug: resolve_name(plug.object),
+    "vec_env_wrapper": lambda plug: resolve_name("rl_zoo3.utils:get_wrapper_class")({"": plug.name}, ""),
+    "nerfstudio.method_configs": lambda plug: plug.name in _discovered("registry:discover_methods"),
+    "nerfstudio.dataparser_configs": lambda plug: plug.name in _discovered("registry_dataparser:discover_dataparsers"),
+    "mlflow.run_context_provider": lambda plug: any(type(one) is resolve_name(plug.object) for one in _providers()),
+}
+"""Whether the host of a plug sees it, by the plug's group."""
+
+
+def _is_a(plug: Plug, kind: str) -> bool:
+    return issubclass(resolve_name(plug.object), resolve_name(kind))
+
+
+def _discovered(function: str) -> Any:
+    return resolve_name(f"nerfstudio.plugins.{function}")()[0]
+
+
+def _providers() -> Any:
+    return resolve_name("mlflow.tracking.context.registry:_run_context_provider_registry")
+
+
+def reasons_of(plugs: str) -> list[str | None]:
+    """Why the hosts do not see plugs, which are given as JSON; None for each that is seen."""
+    return [_reason(Plug(*fields)) for fields in json.loads(plugs)]
+
+
+def _reason(plug: Plug) -> str | None:
+    try:
+        if _SEES[plug.group](plug):
+            return None
+        # The suite's entry points for nerfstudio give a stand-in with the reason for a plug that could not be made.
+        return str(getattr(resolve_name(plug.object), "reason", f"{plug.object} is no {plug.group}"))
+    except Exception as error:  # whatever a host or a plug raises is the answer
+        return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def open_room(simulator: str) -> dict[str, str]:
+    """How a simulator opens the built-in room and renders one small frame: `mark` and `text` of a finding."""
+    import numpy as np
+
+    from avp_habitat.poses import Intrinsics
+    from avp_habitat.simulators.registry import make_simulator
+
+    start = time.monotonic()
+    try:
+        opened = make_simulator(simulator, "builtin:0")
+        pose = np.eye(4)
+        pose[:3, 3] = opened.area.random_points(np.random.default_rng(0), 1)[0] + [0.0, 1.5, 0.0]
+        frames = opened.render(pose[None], Intrinsics.from_hfov(32, 24, hfov_deg=90.0), rgb=True)
+    except AVPError as error:
+        return {"mark": BROKEN, "text": str(error)}
+    if frames.rgb is None or not frames.depth.any():
+        return {"mark": BROKEN, "text": "it rendered an empty picture of the built-in room"}
+    text = f"{opened.version}: opened builtin:0 and rendered in {time.monotonic() - start:.1f} s"
+    return {"mark": OK, "text": text}

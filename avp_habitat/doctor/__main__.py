@@ -1,21 +1,20 @@
 """Command line of the doctor: all checks side by side, one line each in a fixed order."""
 
-import dataclasses
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from avp_habitat import command
-from avp_habitat.doctor import ABSENT, BROKEN, OK, Finding, ask, check_host, check_packages, check_python, read_manifest
+from avp_habitat import command, doctor
+from avp_habitat.doctor import ABSENT, BROKEN, OK, Finding, ask
 from avp_habitat.errors import AVPError, SimulatorError
 from avp_habitat.provenance import version_of
 from avp_habitat.simulators.habitat.graphics import FIRST_DEVICE, choose_gpu, inspect_graphics
-from avp_habitat.simulators.habitat.installed import inspect_installation, require_installed
+from avp_habitat.simulators.habitat.installed import inspect_installation
 
 LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"
 # One of the suite's kernels stands for all.
@@ -30,18 +29,12 @@ Check = Callable[[], list[Finding]]
 def check_simulator(name: str) -> list[Finding]:
     """Whether a simulator opens the built-in room and renders, or why not."""
     subject = f"simulator {name}"
-    try:
-        if name == "habitat":
-            require_installed()
-    except SimulatorError as error:
-        return [Finding(BROKEN if inspect_installation().installed else ABSENT, subject, str(error))]
-    words = ["-m", "avp_habitat.doctor.probe", "simulator", name]
-    answer, failure = ask(words, time_limit_s=120.0)
+    found, failure = ask(doctor.probe(doctor.open_room, name), time_limit_s=120.0)
     if failure is not None:
-        return [Finding(BROKEN, subject, f"{failure}; the whole message: python {' '.join(words)}")]
-    if "error" in answer:
-        return [Finding(BROKEN, subject, answer["error"])]
-    return [Finding(OK, subject, "{version}: opened builtin:0 and rendered in {seconds:.1f} s".format_map(answer))]
+        more = f"python -c 'from avp_habitat.doctor import open_room; print(open_room(\"{name}\"))'"
+        return [Finding(BROKEN, subject, f"{failure}; the whole message: {more}")]
+    absent = name == "habitat" and not inspect_installation().installed
+    return [Finding(ABSENT if absent else found["mark"], subject, found["text"])]
 
 
 def check_graphics() -> list[Finding]:
@@ -101,32 +94,19 @@ def check_lpips() -> list[Finding]:
 
 def all_checks() -> dict[str, Check]:
     """The checks by name, in the order of the report."""
-    plugs = read_manifest()
+    plugs = doctor.read_manifest()
     hosts = dict.fromkeys(plug.host for plug in plugs)
     return {
-        "Python": check_python,
-        "packages": check_packages,
+        "Python": doctor.check_python,
+        "packages": doctor.check_packages,
         "numba": check_compiled,
         "raycast": partial(check_simulator, "raycast"),
         "habitat": partial(check_simulator, "habitat"),
         "graphics": check_graphics,
         "torch": check_cuda,
         "LPIPS": check_lpips,
-        **{host: partial(check_host, host, [plug for plug in plugs if plug.host == host]) for host in hosts},
+        **{host: partial(doctor.check_host, host, [plug for plug in plugs if plug.host == host]) for host in hosts},
     }
-
-
-def findings_of(checks: Mapping[str, Check]) -> Iterator[Finding]:
-    """The findings in the order of the checks, each as soon as it and those before it are known."""
-    pool = ThreadPoolExecutor(max_workers=max(3, os.cpu_count() or 1))
-    futures = {name: pool.submit(check) for name, check in checks.items()}
-    try:
-        for name, future in futures.items():
-            if sys.stderr.isatty() and not future.done():
-                print(f"looking at {name} ...\033[K", end="\r", file=sys.stderr, flush=True)
-            yield from future.result()
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
 
 
 @dataclass(frozen=True)
@@ -141,15 +121,19 @@ class Doctor:
 
 
 def main(options: Doctor) -> None:
-    """Run every check and print what was found; an error when something is broken."""
-    found = []
-    for finding in findings_of(all_checks()):
-        found.append(finding)
-        if not options.json:
-            print(finding.line(colour=sys.stdout.isatty()), flush=True)
+    """Run every check side by side and print what was found in order; an error when something is broken."""
+    found: list[Finding] = []
+    with ThreadPoolExecutor(max_workers=max(3, os.cpu_count() or 1)) as pool:
+        for name, future in {name: pool.submit(check) for name, check in all_checks().items()}.items():
+            if sys.stderr.isatty() and not future.done():
+                print(f"looking at {name} ...\033[K", end="\r", file=sys.stderr, flush=True)
+            found += future.result()
+            if not options.json:
+                for finding in future.result():
+                    print(finding.line(colour=sys.stdout.isatty()), flush=True)
     broken = [finding.subject for finding in found if finding.mark == BROKEN]
     if options.json:
-        print(json.dumps({"ok": not broken, "findings": [dataclasses.asdict(finding) for finding in found]}, indent=2))
+        print(json.dumps({"ok": not broken, "findings": [finding._asdict() for finding in found]}, indent=2))
     if broken:
         raise AVPError(f"broken: {', '.join(broken)}; what to do stands in the lines marked {BROKEN}")
 

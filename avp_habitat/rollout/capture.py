@@ -1,15 +1,23 @@
-"""Filling a rollout folder from a running `AVPEnv`: its views, its steps and what `rollout.json` says about them."""
+"""Filling rollout folders from a running `AVPEnv`, also below any program that steps `AVP-v0` (`RecordRollout`)."""
 
+import multiprocessing
+import os
+import sys
+import weakref
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import asdict
 from datetime import UTC, datetime
-from typing import Any
+from pathlib import Path
+from typing import Any, SupportsFloat
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat import poses
-from avp_habitat.errors import SceneError
+from avp_habitat.errors import AVPError, SceneError, UsageError
+from avp_habitat.files import check_new
 from avp_habitat.metrics import measured
 from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.plugins import name_of
@@ -45,11 +53,6 @@ def heldout_seed(scene_digest: str) -> int:
 def heldout_poses(simulator: Simulator, *, sensor_height_m: float, views: int = VIEWS) -> NDArray[np.float64]:
     """Poses uniform over the navigable area, any yaw, pitch within ±20°, that see at least 1 m far on average.
 
-    Args:
-        simulator: of the scene.
-        sensor_height_m: above the floor, metres.
-        views: how many.
-
     Returns:
         `(views, 4, 4)` habitat camera_to_world; the same for the same scene, always.
 
@@ -74,41 +77,26 @@ def heldout_poses(simulator: Simulator, *, sensor_height_m: float, views: int = 
 
 
 def capture_step(env: AVPEnv, writer: RolloutWriter, action: int, reward: float, info: dict[str, Any]) -> None:
-    """Write the picture, depth, pose and table row of the step that the environment has just done.
-
-    Args:
-        env: the environment, not wrapped.
-        writer: an entered one; its camera takes the picture.
-        action: number of the step's action.
-        reward: of the step.
-        info: of the step.
-    """
-    pose = env.camera_to_world
-    frames = env.capture(pose[None], writer.intrinsics)
-    assert frames.rgb is not None
-    writer.add_frame(frames.rgb[0], frames.depth[0], pose)
+    """Write the picture, depth, pose and table row of the step that the environment, not wrapped, has just done."""
+    writer.add_frame(*_pictured(env, writer, env.camera_to_world))
     writer.add_step(_step_row(env, action, reward, info))
 
 
 def capture_heldout(
     env: AVPEnv, writer: RolloutWriter, views: int, *, progress: Callable[[], object] = lambda: None
 ) -> None:
-    """Write the scene's held-out views.
-
-    Args:
-        env: the environment, not wrapped.
-        writer: an entered one; its camera takes the pictures.
-        views: how many, 0 for none.
-        progress: called after each view.
-    """
+    """Write so many held-out views of the scene; `progress` is called after each."""
     if not views:
         return
-    poses = heldout_poses(env.simulator, sensor_height_m=env.settings.sensor_height_m, views=views)
-    for pose in poses:
-        frames = env.capture(pose[None], writer.intrinsics)
-        assert frames.rgb is not None
-        writer.add_heldout(frames.rgb[0], frames.depth[0], pose)
+    for pose in heldout_poses(env.simulator, sensor_height_m=env.settings.sensor_height_m, views=views):
+        writer.add_heldout(*_pictured(env, writer, pose))
         progress()
+
+
+def _pictured(env: AVPEnv, writer: RolloutWriter, pose: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
+    frames = env.capture(pose[None], writer.intrinsics)
+    assert frames.rgb is not None
+    return frames.rgb[0], frames.depth[0], pose
 
 
 def publish_rollout(
@@ -139,7 +127,10 @@ def publish_rollout(
     floor = _write_floor(env.area, info["avp_trajectory"], writer)
     frames, views = writer.views(heldout=False), writer.views(heldout=True)
     rollout = Rollout(writer.path(""), _scene_and_task(env, heldout), writer.intrinsics, frames, views)
-    metrics = info["avp_episode"] | _visibility(rollout) | measured(env.settings.metrics, "rollout", rollout)
+    # From the files, in whole millimetres, so that the figure is the one that a reader of the folder computes.
+    seen = visibility_of(frames, views, writer.intrinsics).figures() if views else {}
+    visibility = {"visibility": seen["visibility"]} if "visibility" in seen else {}
+    metrics = info["avp_episode"] | visibility | measured(env.settings.metrics, "rollout", rollout)
     about = {"policy": policy, "seed": seed, "metrics": metrics, "floor": floor, "mlflow_run_id": mlflow_run_id}
     writer.publish(rollout.meta | about)
     return metrics
@@ -158,14 +149,6 @@ def _write_floor(area: NavigableArea, trajectory: Trajectory, writer: RolloutWri
     }
 
 
-def _visibility(rollout: Rollout) -> dict[str, float]:
-    """From the files, in whole millimetres, so that the figure is the one that a reader of the folder computes."""
-    if not rollout.heldout:
-        return {}
-    found = visibility_of(rollout.frames, rollout.heldout, rollout.intrinsics).figures()
-    return {name: value for name, value in found.items() if name == "visibility"}
-
-
 def _step_row(env: AVPEnv, action: int, reward: float, info: dict[str, Any]) -> dict[str, Any]:
     position, yaw, pitch = env.agent_pose
     return {
@@ -177,9 +160,7 @@ def _step_row(env: AVPEnv, action: int, reward: float, info: dict[str, Any]) -> 
         "new_cells": info["new_cells"],
         "collided": int(info["collided"]),
         "redundant": int(info["redundant"]),
-        "x_m": f"{position[0]:.6f}",
-        "y_m": f"{position[1]:.6f}",
-        "z_m": f"{position[2]:.6f}",
+        **{f"{axis}_m": f"{value:.6f}" for axis, value in zip("xyz", position, strict=True)},
         "yaw_rad": f"{yaw:.9f}",
         "pitch_rad": f"{pitch:.9f}",
     }
@@ -195,10 +176,7 @@ def _scene_and_task(env: AVPEnv, heldout: int) -> dict[str, Any]:
         "budget": settings.budget,
         "actions": {
             "names": list(ACTION_NAMES),
-            "forward_m": settings.forward_m,
-            "turn_deg": settings.turn_deg,
-            "tilt_deg": settings.tilt_deg,
-            "pitch_limit_deg": settings.pitch_limit_deg,
+            **{name: getattr(settings, name) for name in ("forward_m", "turn_deg", "tilt_deg", "pitch_limit_deg")},
         },
         "camera": {"hfov_deg": settings.hfov_deg, "height_above_floor_m": settings.sensor_height_m},
         "coverage": {
@@ -216,3 +194,133 @@ def _scene_and_task(env: AVPEnv, heldout: int) -> dict[str, Any]:
         "versions": installed_versions(_VERSIONED),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+
+
+class RecordRollout(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
+    """Writes the first finished episodes as rollout folders and changes nothing else.
+
+    An episode that is abandoned (by another `reset` or by `close`) leaves no folder.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        folder: str | Path,
+        *,
+        episodes: int = 1,
+        heldout: int = VIEWS,
+        width: int = 640,
+        height: int = 480,
+        policy: str = "not named",
+    ) -> None:
+        """Wrap an environment.
+
+        Args:
+            env: an `AVPEnv`, also a wrapped one.
+            folder: of the first episode; the k-th later one goes to `FOLDER-k`, counted from 2. None may exist.
+            episodes: how many to record, at least 1.
+            heldout: number of held-out views in each folder.
+            width: of the pictures in pixels.
+            height: of the pictures in pixels.
+            policy: what `rollout.json` calls the policy; the environment cannot know it.
+
+        Raises:
+            UsageError: not an `AVPEnv`, fewer than one episode, pictures of no size, or a folder exists.
+        """
+        gymnasium.utils.RecordConstructorArgs.__init__(
+            self, folder=folder, episodes=episodes, heldout=heldout, width=width, height=height, policy=policy
+        )
+        super().__init__(env)
+        if not isinstance(env.unwrapped, AVPEnv):
+            raise UsageError(f"RecordRollout: expected an AVPEnv, got {type(env.unwrapped).__name__}")
+        if episodes < 1:
+            raise UsageError(f"RecordRollout: episodes: expected at least 1, got {episodes}")
+        self._avp = env.unwrapped
+        self._camera = Intrinsics.from_hfov(width, height, hfov_deg=self._avp.settings.hfov_deg)
+        self._heldout = heldout
+        self._policy = policy
+        first = Path(folder)
+        later = [first.with_name(f"{first.name}-{number}") for number in range(2, episodes + 1)]
+        self._targets = [first, *later]
+        for target in self._targets:
+            check_new(target)
+        self._seed: int | None = None
+        self._writer: RolloutWriter | None = None
+        self._open = ExitStack()
+        # Programs that never call close() leave no temporary folder either.
+        weakref.finalize(self, self._open.close)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode, recorded if there are folders left to write."""
+        self._drop()
+        answer = self.env.reset(seed=seed, options=options)
+        self._seed = seed
+        if self._targets:
+            self._writer = self._open.enter_context(RolloutWriter(self._targets[0], self._camera))
+        return answer
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Do one action and record its view."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if self._writer is not None:
+            try:
+                self._record(self._writer, int(action), float(reward), info, ended=terminated or truncated)
+            except BaseException:
+                # The writer removes what it has written, and says it when the disk was at fault.
+                self._writer = None
+                self._open.__exit__(*sys.exc_info())
+                raise
+        return observation, reward, terminated, truncated, info
+
+    def close(self) -> None:
+        """Drop an unfinished recording and close the environment."""
+        self._drop()
+        super().close()
+
+    def _drop(self) -> None:
+        self._open.close()
+        self._writer = None
+
+    def _record(self, writer: RolloutWriter, action: int, reward: float, info: dict[str, Any], *, ended: bool) -> None:
+        capture_step(self._avp, writer, action, reward, info)
+        if not ended:
+            return
+        capture_heldout(self._avp, writer, self._heldout)
+        publish_rollout(
+            self._avp,
+            writer,
+            info,
+            policy={"name": self._policy},
+            seed=self._seed,
+            heldout=self._heldout,
+            mlflow_run_id=os.environ.get("MLFLOW_RUN_ID"),
+        )
+        episode = info["avp_episode"]
+        print(f"{writer.folder}: {episode['views']:.0f} views, coverage {100 * episode['coverage']:.1f} %")
+        del self._targets[0]
+        self._drop()
+
+
+def make_env(*, record: str | Path | None = None, record_options: dict[str, Any] | None = None, **kwargs: Any) -> Any:
+    """`AVP-v0` as gymnasium makes it: an `AVPEnv`, within a `RecordRollout` where the folder `record` is given.
+
+    The record's options are further arguments of `RecordRollout`, for example `{"episodes": 3}`.
+
+    Raises:
+        AVPError: as `AVPEnv` and `RecordRollout`, or options for a recording without a folder.
+        SystemExit: instead in a worker of SB3's `SubprocVecEnv`, which then ends with one line.
+    """
+    try:
+        if record is None and record_options:
+            raise UsageError("record_options: expected a folder as `record` with them, got none")
+        env = AVPEnv(**kwargs)
+        return env if record is None else RecordRollout(env, record, **(record_options or {}))
+    except AVPError as error:
+        worker = getattr(multiprocessing.current_process(), "_target", None)
+        if getattr(worker, "__module__", None) == "stable_baselines3.common.vec_env.subproc_vec_env":
+            raise SystemExit(f"error: {error}") from None
+        raise
+
+
+# Gymnasium reads the render modes from the entry point.
+make_env.metadata = AVPEnv.metadata  # type: ignore[attr-defined]

@@ -23,15 +23,9 @@ _LEGEND = (
 
 
 def draw_trajectory(area: NavigableArea, trajectory: Trajectory, *, longest_px: int = 720) -> NDArray[np.uint8]:
-    """Draw one episode from above; +X is right, +Z is down, a scale bar gives the metres.
+    """`(h, w, 3)` picture of an episode, also one that still runs, from above; +X is right, +Z is down.
 
-    Args:
-        area: of the scene.
-        trajectory: of one agent, also of an episode that still runs.
-        longest_px: of the longer side of the map in pixels.
-
-    Returns:
-        `(h, w, 3)` uint8.
+    The longer side of the map has about `longest_px` pixels; a scale bar gives the metres.
     """
     rows, columns = area.mask.shape
     scale = max(1, round(longest_px / max(rows, columns)))

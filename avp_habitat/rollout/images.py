@@ -47,11 +47,7 @@ def encode_png(pixels: NDArray[np.unsignedinteger], kind: PngKind) -> bytes:
 
     Every row is stored as its difference to the row above (filter "up"), so that nothing is tried out. ISA-L's deflate
     takes a quarter of the time of zlib's fastest setting on rendered pictures, for smaller files; its higher levels
-    gain little.
-
-    Args:
-        pixels: `(height, width)` or `(height, width, channels)`, as `kind` says.
-        kind: of the file.
+    gain little. The pixels are `(height, width)` or `(height, width, channels)`, as `kind` says.
     """
     height, width = pixels.shape[:2]
     rows = np.ascontiguousarray(pixels, f">u{kind.bits // 8}").view(np.uint8).reshape(height, -1)
@@ -90,11 +86,7 @@ def write_numbers(path: Path, numbers: NDArray[np.uint16]) -> None:
 
 
 def read_numbers(path: Path) -> NDArray[np.uint16]:
-    """Read a 16-bit grey PNG as `(height, width)` whole numbers.
-
-    Raises:
-        RolloutError: the picture cannot be decoded; likewise in the other functions that read.
-    """
+    """Read a 16-bit grey PNG as `(height, width)` whole numbers; what cannot be decoded is a `RolloutError`."""
     return _decoded(path).astype(np.uint16)
 
 
@@ -123,12 +115,6 @@ def check_png_structure(path: str, *, width: int, height: int, kind: PngKind) ->
     Two short reads find a file that is empty, cut short or something else. What lies between is not read: that is
     `check_png_contents`.
 
-    Args:
-        path: of the file.
-        width: expected, in pixels.
-        height: expected, in pixels.
-        kind: expected.
-
     Raises:
         RolloutError: the file is unreadable, no whole PNG, or of another size or kind.
     """
@@ -152,11 +138,8 @@ def check_png_structure(path: str, *, width: int, height: int, kind: PngKind) ->
 def check_png_contents(path: Path) -> None:
     """Hold every chunk of a PNG to its checksum (CRC-32), which finds any damaged byte; nothing is decoded.
 
-    Args:
-        path: of a file that passed `check_png_structure`.
-
     Raises:
-        RolloutError: the file is unreadable or damaged.
+        RolloutError: the file, which passed `check_png_structure`, is damaged.
     """
     try:
         with Image.open(path, formats=["PNG"]) as image:

@@ -34,15 +34,10 @@ class RolloutWriter:
     """
 
     def __init__(self, folder: str | Path, intrinsics: Intrinsics) -> None:
-        """Reserve a folder.
-
-        Args:
-            folder: the final name; must not exist.
-            intrinsics: of every picture.
+        """Name the folder, which must not exist, and the camera of every picture.
 
         Raises:
             UsageError: the folder exists.
-            RolloutError: its parent cannot be written.
         """
         self.folder = Path(folder)
         self.intrinsics = intrinsics
@@ -55,13 +50,16 @@ class RolloutWriter:
         self._pending: deque[Future[None]] = deque()
 
     def __enter__(self) -> "RolloutWriter":
-        """Make the temporary folder."""
-        self._partial = self._context.enter_context(atomic_folder(self.folder, failure=RolloutError, option="--out"))
-        try:
+        """Make the temporary folder.
+
+        Raises:
+            RolloutError: nothing can be written there.
+        """
+        with ExitStack() as context:
+            self._partial = context.enter_context(atomic_folder(self.folder, failure=RolloutError, option="--out"))
             for kind in _FOLDERS:
                 self.path(kind).mkdir(parents=True)
-        except OSError as error:
-            self._context.__exit__(type(error), error, error.__traceback__)
+            self._context = context.pop_all()
         return self
 
     def __exit__(
@@ -78,7 +76,7 @@ class RolloutWriter:
         self._add("", rgb, depth, pose)
 
     def add_heldout(self, rgb: NDArray[np.uint8], depth: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
-        """Write the next held-out view: `(h, w, 3)` uint8, `(h, w)` metres, `(4, 4)` habitat camera_to_world."""
+        """Write the next held-out view, as `add_frame` takes it."""
         self._add(HELDOUT, rgb, depth, pose)
 
     def add_step(self, row: Mapping[str, Any]) -> None:
@@ -96,10 +94,7 @@ class RolloutWriter:
         return self._partial / name
 
     def publish(self, meta: Mapping[str, Any]) -> Path:
-        """Write the tables, then give the folder its final name.
-
-        Args:
-            meta: the keys of `rollout.json` beyond format, counts, camera size and pose convention.
+        """Write the tables, `rollout.json` with these further keys, then give the folder its final name.
 
         Raises:
             UsageError: a folder of that name has appeared meanwhile.
@@ -137,14 +132,14 @@ class RolloutWriter:
         }
 
     def _transforms(self) -> dict[str, Any]:
-        names: dict[str, list[str]] = {"": [], HELDOUT: []}
+        names: dict[str, list[str]] = {}
         frames = []
         for base, poses in self._poses.items():
-            for index, pose in enumerate(poses):
-                view = view_of(Path(base), index, pose)
-                names[base].append(view.image.as_posix())
+            views = [view_of(Path(base), index, pose) for index, pose in enumerate(poses)]
+            names[base] = [view.image.as_posix() for view in views]
+            for view in views:
                 files = {"file_path": view.image.as_posix(), "depth_file_path": view.depth.as_posix()}
-                frames.append({**files, "transform_matrix": pose.tolist()})
+                frames.append({**files, "transform_matrix": view.camera_to_world.tolist()})
         camera = self.intrinsics
         return {
             "camera_model": "OPENCV",

@@ -1,6 +1,6 @@
 """What a planner may know about one agent: its state, and the floor cells that it has observed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, NoReturn
 
 import numpy as np
@@ -18,30 +18,19 @@ class SimulatorElsewhere:
     """A `Simulator` that cannot look: the one it stands for is in another process."""
 
     name: str
-    """As of the simulator."""
     version: str
-    """As of the simulator."""
     scene: str
-    """As of the simulator."""
     scene_digest: str
-    """As of the simulator."""
     scene_frame: Frame
-    """As of the simulator."""
     area: NavigableArea
-    """As of the simulator."""
 
     @classmethod
     def of(cls, simulator: Simulator) -> "SimulatorElsewhere":
         """What another process may know."""
-        about = (simulator.scene, simulator.scene_digest, simulator.scene_frame)
-        return cls(simulator.name, simulator.version, *about, simulator.area)
+        return cls(**{field.name: getattr(simulator, field.name) for field in fields(cls)})
 
     def render(self, *_: Any, **__: Any) -> NoReturn:
-        """Refused.
-
-        Raises:
-            SimulatorError: always.
-        """
+        """Refused by a `SimulatorError`."""
         raise SimulatorError(
             f"{self.scene}: its simulator is in another process and cannot be asked for views here; run a planner that "
             "looks at the whole scene (oracle, survey) without SubprocVecEnv"

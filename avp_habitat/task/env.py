@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +21,16 @@ from avp_habitat.task.task import StepOutcome, ViewpointTask
 from avp_habitat.task.trajectory import episode_metrics
 
 RENDER_MODES = ("rgb_array",)
+_OPTIONS = ("scene", "simulator", "gpu", "navmesh", "up", *TaskSettings.__dataclass_fields__)
 _PICTURE = (480, 360)
 
 
 class AVPEnv(gymnasium.Env[Observed, np.int64]):
     """An agent that walks through a scene and decides which views to take.
 
-    Observations are the twelve numbers of `observations.NAMES`, with `observation="map"` followed by a map of what was
-    seen of the floor, with `"surface_map"` by those of walls, furniture and ceiling too, or of one's own kind; actions
-    are the six of `settings.ACTION_NAMES`. `info` of every step holds `coverage`, `new_cells`, `views`, `collided`,
-    `redundant` and `reward_parts`; the last step of an episode adds `avp_episode` (figures, see
-    `trajectory.episode_metrics`), `avp_trajectory` and `is_success`.
+    Observations are of the kind `TaskSettings.observation`, actions the six of `settings.ACTION_NAMES`. `info` of every
+    step holds `coverage`, `new_cells`, `views`, `collided`, `redundant` and `reward_parts`; the last step of an episode
+    adds `avp_episode` (figures, see `trajectory.episode_metrics`), `avp_trajectory` and `is_success`.
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 4}  # noqa: RUF012 - gymnasium's own declaration
@@ -68,7 +68,9 @@ class AVPEnv(gymnasium.Env[Observed, np.int64]):
         """
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise unknown_name("render_mode", render_mode, RENDER_MODES)
-        self.settings = _with_overrides(settings or TaskSettings(), overrides)
+        for name in overrides.keys() - TaskSettings.__dataclass_fields__:
+            raise unknown_name("AVP-v0 option", name, _OPTIONS)
+        self.settings = replace(settings or TaskSettings(), **overrides)
         self.choice = SimulatorChoice.by_name(simulator, gpu=gpu, navmesh=navmesh, up=up)
         """How the simulator was chosen; None for one that was open already."""
         self.render_mode = render_mode
@@ -79,13 +81,9 @@ class AVPEnv(gymnasium.Env[Observed, np.int64]):
     def change_scene(self, scene: str | Path) -> None:
         """Leave the scene for another one in the same kind of simulator; `reset` starts there.
 
-        Args:
-            scene: as for a new environment.
-
         Raises:
             UsageError: the simulator was given open, or its NavMesh is that of the present scene.
-            SceneError: the scene cannot be used.
-            SimulatorError: the simulator cannot open it.
+            AVPError: as for a new environment.
         """
         if self.choice is None:
             raise UsageError("change_scene: expected a simulator chosen by name, got one that was open already")
@@ -131,9 +129,7 @@ class AVPEnv(gymnasium.Env[Observed, np.int64]):
     ) -> tuple[Observed, dict[str, Any]]:
         """Start an episode at a random navigable point and heading.
 
-        Args:
-            seed: of the environment's random generator.
-            options: `position` (x, z or x, y, z in metres) and `yaw` (radians) place the agent instead.
+        The options `position` (x, z or x, y, z in metres) and `yaw` (radians) place the agent instead.
 
         Raises:
             UsageError: the given position is not navigable.
@@ -148,7 +144,7 @@ class AVPEnv(gymnasium.Env[Observed, np.int64]):
             yaw = np.array([float(options["yaw"])])
         observation = self._task.reset([0], position, yaw)
         self._running = True
-        return each(_first, observation), {"coverage": 0.0, "views": 0}
+        return each(itemgetter(0), observation), {"coverage": 0.0, "views": 0}
 
     def step(self, action: np.int64 | int) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
         """Do one action and capture one view.
@@ -165,7 +161,7 @@ class AVPEnv(gymnasium.Env[Observed, np.int64]):
         info = step_info(self._task, outcome)[0]
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         self._running = not (terminated or truncated)
-        return each(_first, outcome.observation), float(outcome.reward[0]), terminated, truncated, info
+        return each(itemgetter(0), outcome.observation), float(outcome.reward[0]), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """The camera's picture beside the top-down map, `(h, w, 3)`; None without a render mode."""
@@ -207,10 +203,6 @@ class AVPEnv(gymnasium.Env[Observed, np.int64]):
         return point
 
 
-def _first(values: NDArray[Any]) -> Any:
-    return values[0]
-
-
 def step_info(task: ViewpointTask, outcome: StepOutcome) -> list[dict[str, Any]]:
     """`info` of all agents' steps; those whose episode ends there get its figures and trajectory."""
     facts = outcome.facts
@@ -238,14 +230,3 @@ def step_info(task: ViewpointTask, outcome: StepOutcome) -> list[dict[str, Any]]
         infos[row]["avp_trajectory"] = trajectory
         infos[row]["is_success"] = stopped
     return infos
-
-
-def _with_overrides(settings: TaskSettings, overrides: dict[str, Any]) -> TaskSettings:
-    for name in overrides:
-        if name not in TaskSettings.__dataclass_fields__:
-            raise unknown_name(
-                "AVP-v0 option",
-                name,
-                ["scene", "simulator", "gpu", "navmesh", "up", *TaskSettings.__dataclass_fields__],
-            )
-    return replace(settings, **overrides)

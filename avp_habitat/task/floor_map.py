@@ -74,9 +74,10 @@ class MapObserver:
         """Number the scene's cells."""
         self._origin = area.origin
         self._cell_m = area.cell_m
+        index = np.full(area.mask.shape, -1, dtype=np.int32)
+        index[area.mask] = np.arange(np.count_nonzero(area.mask))
         # A border of cells outside, so that every cell has four neighbours.
-        self._index = np.full((area.mask.shape[0] + 2, area.mask.shape[1] + 2), -1, dtype=np.int32)
-        self._index[1:-1, 1:-1][area.mask] = np.arange(np.count_nonzero(area.mask))
+        self._index = np.pad(index, 1, constant_values=-1)
 
     def observe(
         self,
@@ -85,17 +86,10 @@ class MapObserver:
         position: NDArray[np.floating],
         yaw: NDArray[np.floating],
     ) -> NDArray[np.float32]:
-        """The maps of k agents.
+        """`(k, SIZE)` within [0, 1], channel after channel, row after row from ahead to behind, left to right.
 
-        Args:
-            first_seen: `(n, >= m)` 0 for cells not observed.
-            rows: `(k,)` the agents' rows of it.
-            position: `(k, 3)` their feet, metres.
-            yaw: `(k,)` radians.
-
-        Returns:
-            `(k, SIZE)` within [0, 1], channel after channel, row after row from ahead to behind, left to right. What
-            lies beyond the map is drawn on its border, frontiers only.
+        What lies beyond the map is drawn on its border, frontiers only. The agents' feet are `(k, 3)` metres; the rest
+        is as for `draw`.
         """
         maps = np.zeros((len(rows), len(CHANNELS), SIDE, SIDE), dtype=np.float32)
         place = (np.asarray(position)[:, [0, 2]] - self._origin) / self._cell_m

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from avp_habitat.compiled import njit
 from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.poses import camera_to_world, heading, wrap_angle
+from avp_habitat.task.rewards import RewardConstants
 from avp_habitat.task.settings import LOOK_DOWN, LOOK_UP, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, TaskSettings
 
 Float = NDArray[np.float64]
@@ -60,23 +61,21 @@ def history(
     angles: NDArray[np.float64],
     cells: NDArray[np.int64],
     steps: NDArray[np.int64],
-    *,
-    distance_m: float,
-    angle_rad: float,
+    constants: RewardConstants,
 ) -> History:
-    """Compare each agent's newest view with its earlier ones.
+    """Compare each agent's newest view with its earlier ones, by the constants' d_red and δ.
 
     Args:
         path: `(n, T + 1, 3)` the start and the positions after each step, metres.
         angles: `(n, T + 1, 2)` yaw and pitch, radians.
         cells: `(n, T + 1, 2)` row and column of the floor cells under the positions.
         steps: `(n,)` t; entries after t are not read.
-        distance_m: d_red.
-        angle_rad: δ.
+        constants: of the rewards.
     """
     count = len(steps)
     answer = History(np.zeros(count, np.int64), np.zeros(count, np.bool_), np.zeros(count))
-    _compare(path, angles, cells, steps, distance_m, angle_rad, *answer)
+    angle_rad = float(np.radians(constants.redundancy_angle_deg))
+    _compare(path, angles, cells, steps, constants.redundancy_distance_m, angle_rad, *answer)
     return answer
 
 

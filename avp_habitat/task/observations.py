@@ -53,9 +53,8 @@ class SceneAgents:
 
     def floor_maps(self) -> NDArray[np.float32]:
         """As `Agents.floor_maps`."""
-        side, views = floor_map.SIDE, self.views
-        maps = self._floor.observe(self._first_seen, self._rows, views.position, views.yaw)
-        return maps.reshape(-1, len(floor_map.CHANNELS), side, side)
+        maps = self._floor.observe(self._first_seen, self._rows, self.views.position, self.views.yaw)
+        return maps.reshape(-1, len(floor_map.CHANNELS), floor_map.SIDE, floor_map.SIDE)
 
     def surface_maps(self) -> NDArray[np.float32]:
         """As `Agents.surface_maps`."""
@@ -67,10 +66,7 @@ class SceneAgents:
 
 @dataclass(frozen=True)
 class Agents:
-    """n agents at this moment, from which observations are computed; every array's first axis is n.
-
-    Methods compute what they return, for those kinds of observation that ask for it.
-    """
+    """n agents at this moment, from which observations are computed; every array's first axis is n."""
 
     settings: TaskSettings
     """Of the task."""
@@ -194,8 +190,8 @@ class Numbers:
 
     def __init__(self, settings: TaskSettings) -> None:
         """Say the space."""
-        low, high = np.zeros(self.further, np.float32), np.ones(self.further, np.float32)
-        self.space = Box(np.concatenate([LOW, low]), np.concatenate([HIGH, high]), dtype=np.float32)
+        low, high = np.pad(LOW, (0, self.further)), np.ones(len(HIGH) + self.further, np.float32)
+        self.space = Box(low, high, dtype=np.float32)
 
     def __call__(self, agents: Agents) -> NDArray[np.float32]:
         """`(n, 12 + further)` float32."""
@@ -269,12 +265,8 @@ def _fitted(space: gymnasium.Space[Any], value: Any, agents: int, where: str) ->
     bounds = isinstance(space, Box)
     inside = (array >= space.low) & (array <= space.high) if bounds else np.array([*map(space.contains, array)])
     if not inside.all():
-        raise UsageError(f"{where}: expected values within {_range(space)}, got {array[~inside].flat[0]}")
+        raise UsageError(f"{where}: expected values within {space}, got {array[~inside].flat[0]}")
     return array
-
-
-def _range(space: gymnasium.Space[Any]) -> str:
-    return f"[{space.low.min():g}, {space.high.max():g}]" if isinstance(space, Box) else str(space)
 
 
 def each(function: Callable[..., Any], *observed: Observed) -> Observed:

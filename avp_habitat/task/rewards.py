@@ -12,7 +12,6 @@ from avp_habitat import plugins
 from avp_habitat.errors import UsageError
 from avp_habitat.ranges import Range, hold_ranges
 
-Float = NDArray[np.floating]
 Number = NDArray[np.number]
 Bool = NDArray[np.bool_]
 Amount = Annotated[float, Range(0, 1000)]
@@ -164,10 +163,7 @@ REWARDS_HELP = f"{', '.join(REWARDS)} or MODULE:FUNCTION"
 
 
 def find_reward(reward: str | RewardFunction) -> RewardFunction:
-    """The function of a reward.
-
-    Args:
-        reward: a name as `plugins.find` takes it, or the function itself.
+    """The function of a reward, which is given by a name as `plugins.find` takes it, or itself.
 
     Raises:
         UsageError: no such reward, or it is no function of a step's facts and the constants.
@@ -201,12 +197,7 @@ def stops_episode(facts: StepFacts, constants: RewardConstants) -> Bool:
 def reward_parts(
     reward: RewardFunction, facts: StepFacts, constants: RewardConstants
 ) -> dict[str, NDArray[np.float64]]:
-    """The parts of a reward, `(n,)` each, as its function names them; the reward is their sum.
-
-    Args:
-        reward: as `find_reward` gives it.
-        facts: of one step of n agents.
-        constants: of all rewards.
+    """The parts of a reward that `find_reward` gave, `(n,)` each, as its function names them; the reward is their sum.
 
     Raises:
         UsageError: there is no part, or one is neither one finite number for each agent nor one for all of them.
@@ -215,22 +206,19 @@ def reward_parts(
     if not isinstance(parts, Mapping) or not parts:
         got = "none" if isinstance(parts, Mapping) else type(parts).__name__
         raise UsageError(f"reward {plugins.name_of(reward)}: expected parts by name, as {{'new': …}}, got {got}")
-    agents = len(facts.coverage)
-    return {name: _for_each(agents, value, reward, name) for name, value in parts.items()}
+    agents, checked = len(facts.coverage), {}
+    for name, value in parts.items():
+        try:
+            checked[name] = _for_each(agents, value)
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"reward {plugins.name_of(reward)}: part {name!r}: {error}") from None
+    return checked
 
 
-def _for_each(agents: int, value: Number | float, reward: RewardFunction, part: str) -> NDArray[np.float64]:
-    try:
-        numbers = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise _wrong_part(reward, part, "numbers", repr(value)) from None
+def _for_each(agents: int, value: Number | float) -> NDArray[np.float64]:
+    numbers = np.asarray(value, dtype=np.float64)
     if not np.isfinite(numbers).all():
-        raise _wrong_part(reward, part, "finite numbers", repr(value))
+        raise ValueError(f"expected finite numbers, got {' '.join(repr(value).split())}")
     if numbers.shape not in ((), (agents,)):
-        raise _wrong_part(reward, part, f"one number for each of {agents} agents", f"shape {numbers.shape}")
+        raise ValueError(f"expected one number for each of {agents} agents, got shape {numbers.shape}")
     return np.full(agents, numbers) if numbers.ndim == 0 else numbers
-
-
-def _wrong_part(reward: RewardFunction, part: str, expected: str, got: str) -> UsageError:
-    words = " ".join(got.split())
-    return UsageError(f"reward {plugins.name_of(reward)}: part {part!r}: expected {expected}, got {words}")

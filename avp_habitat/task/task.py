@@ -4,8 +4,9 @@
 together. Every step of an agent captures one view, also a step that does not move it.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -16,14 +17,13 @@ from avp_habitat.simulators.base import Simulator
 from avp_habitat.surface.memory import RoomSurface
 from avp_habitat.task import motion
 from avp_habitat.task.agent_view import AgentView
-from avp_habitat.task.cast import CastSensor
+from avp_habitat.task.cast import CastSensor, TableSensor
 from avp_habitat.task.floor_map import MapObserver
-from avp_habitat.task.lookup import TableSensor
 from avp_habitat.task.observations import Agents, Observed, SceneAgents, make_observation
 from avp_habitat.task.rewards import StepFacts, find_reward, has_stop, reward_parts, stops_episode
 from avp_habitat.task.settings import MOVE_FORWARD, STOP, TaskSettings
 from avp_habitat.task.trajectory import Trajectory
-from avp_habitat.task.views import Sensor, Shown, Views, centre_depth
+from avp_habitat.task.views import Shown, Views
 
 Float = NDArray[np.floating]
 Rows = NDArray[np.int64]
@@ -52,7 +52,7 @@ class _Room:
     """One scene and the agents in it."""
 
     simulator: Simulator
-    sensor: Sensor
+    sensor: CastSensor | TableSensor
     floor: MapObserver
     surface: RoomSurface | None
     rows: Rows
@@ -62,12 +62,9 @@ class ViewpointTask:
     """The state of n agents, each in its scene."""
 
     def __init__(self, simulators: Simulator | Sequence[Simulator], settings: TaskSettings, agents: int) -> None:
-        """Make room for n agents; `reset` places them.
+        """Make room for n agents, at least 1; `reset` places them.
 
-        Args:
-            simulators: one for each scene, never named further; agent i is in scene i modulo their number.
-            settings: of the task.
-            agents: n, at least 1.
+        With several simulators, one for each scene, agent i is in scene i modulo their number.
 
         Raises:
             UsageError: the settings ask for what a simulator cannot do.
@@ -86,8 +83,7 @@ class ViewpointTask:
         self._diameter = np.array([area.diameter_m for area in areas])
         self.steps = np.zeros(agents, dtype=np.int64)
         self.position = np.zeros((agents, 3))
-        self.yaw = np.zeros(agents)
-        self.pitch = np.zeros(agents)
+        self.yaw, self.pitch = np.zeros((2, agents))
         self._first_seen = np.zeros((agents, self._cells.max()), dtype=np.int16)
         self._observed = np.zeros(agents, dtype=np.int64)
         self._collided = np.zeros(agents, dtype=np.bool_)
@@ -95,10 +91,9 @@ class ViewpointTask:
         self._path = np.zeros((agents, settings.budget + 1, 3))
         self._angles = np.zeros((agents, settings.budget + 1, 2))
         self._cell = np.zeros((agents, settings.budget + 1, 2), dtype=np.int64)
-        logged = ("action", "reward", "coverage", "collided", "redundant")
-        self._log = {name: np.zeros((agents, settings.budget)) for name in logged}
+        self._log: dict[str, NDArray[np.float64]] = defaultdict(partial(np.zeros, (agents, settings.budget)))
         # By the names that the reward gives them, from the first step that has them; zero in all others.
-        self._parts: dict[str, NDArray[np.float64]] = {}
+        self._parts: dict[str, NDArray[np.float64]] = defaultdict(partial(np.zeros, (agents, settings.budget)))
 
     def _room(self, scene: Simulator, index: int) -> _Room:
         settings, rows = self.settings, np.flatnonzero(self._room_of == index)
@@ -123,8 +118,12 @@ class ViewpointTask:
         return None if surface is None else float(surface.quality(row).mean())
 
     def centre_depth(self, row: int) -> float:
-        """Planar depth in metres in the middle of an agent's newest view, the whole range where nothing is hit."""
-        return float(centre_depth(self.simulator(row), self.settings, self._views(np.array([row])))[0])
+        """Planar depth in metres at an agent's newest view's middle pixel, the whole range where nothing is hit."""
+        whole = self.settings.intrinsics
+        column, line = whole.width // 2, whole.height // 2
+        pixel = poses.Intrinsics(1, 1, whole.fx, whole.fy, whole.cx - column, whole.cy - line)
+        pose = self._views(np.array([row])).camera_to_world
+        return float(self.simulator(row).render(pose, pixel, rgb=False).depth[0, 0, 0]) or self.settings.max_range_m
 
     @property
     def coverage(self) -> NDArray[np.float64]:
@@ -137,39 +136,27 @@ class ViewpointTask:
         return motion.sensor_poses(self.settings, self.position, self.yaw, self.pitch)
 
     def reset(self, rows: Sequence[int] | NDArray[np.integer], position: Float, yaw: Float) -> Observed:
-        """Start new episodes of some agents, looking straight ahead.
+        """Start new episodes of some agents, looking straight ahead; these views are not captured.
 
-        Args:
-            rows: which agents.
-            position: `(len(rows), 3)` their feet, metres.
-            yaw: `(len(rows),)` radians.
-
-        Returns:
-            The first observations of these agents; their views are not captured and observe nothing.
+        Their feet are `(len(rows), 3)` metres, their yaw is `(len(rows),)` radians.
         """
         rows = np.asarray(rows, dtype=np.int64)
         self.position[rows], self.yaw[rows], self.pitch[rows] = position, poses.wrap_angle(yaw), 0.0
         self.steps[rows], self._first_seen[rows], self._collided[rows], self._observed[rows] = 0, 0, False, 0
         self._remember(rows)
-        least, mean = np.empty((2, len(rows)))
         for room, chosen in self._by_room(rows):
-            seen = room.sensor.look(self._views(rows[chosen]))
-            least[chosen], mean[chosen] = seen.least, seen.mean
             if room.surface is not None:
                 room.surface.reset(rows[chosen])
-        return self._observe(rows, Shown(least, mean, np.zeros(len(rows), dtype=np.int64)), np.zeros(len(rows)))
+        seen = self._shown(rows, lambda room, there: room.sensor.look(self._views(there)))
+        return self._observe(rows, seen, np.zeros(len(rows)))
 
     def step(self, actions: NDArray[np.integer]) -> StepOutcome:
-        """Advance every agent by one action and one captured view.
-
-        Args:
-            actions: `(n,)` numbers of `settings.ACTION_NAMES`.
-        """
+        """Advance every agent by one of `(n,)` actions, numbers of `settings.ACTION_NAMES`, and one captured view."""
         actions = np.asarray(actions)
         self._collided = self._move(actions)
         self.steps += 1
         self._remember(self._everyone)
-        seen = self._capture()
+        seen = self._shown(self._everyone, self._capture)
         self._observed += seen.new_cells
         facts = self._facts(actions, seen.new_cells, self._capture_surface())
         parts = reward_parts(self._reward, facts, self.settings.constants)
@@ -188,24 +175,22 @@ class ViewpointTask:
     def trajectory(self, row: int) -> Trajectory:
         """Copies of what one agent did so far in its episode."""
         steps = int(self.steps[row])
-        log, parts = (
-            {name: values[row, :steps].copy() for name, values in columns.items()}
-            for columns in (self._log, self._parts)
-        )
         position = self._path[row, 1 : steps + 1].copy()
         yaw, pitch = self._angles[row, 1 : steps + 1].T.copy()
+        names = ("action", "reward", "coverage", "collided", "redundant")
+        logged = {name: self._log[name][row, :steps].copy() for name in names}
         return Trajectory(
             start=self._path[row, 0].copy(),
             position=position,
             yaw=yaw,
             pitch=pitch,
             camera_to_world=motion.sensor_poses(self.settings, position, yaw, pitch),
-            action=log["action"].astype(np.int64),
-            reward=log["reward"],
-            reward_parts=parts,
-            coverage=log["coverage"],
-            collided=log["collided"].astype(np.bool_),
-            redundant=log["redundant"].astype(np.bool_),
+            action=logged["action"].astype(np.int64),
+            reward=logged["reward"],
+            reward_parts={name: values[row, :steps].copy() for name, values in self._parts.items()},
+            coverage=logged["coverage"],
+            collided=logged["collided"].astype(np.bool_),
+            redundant=logged["redundant"].astype(np.bool_),
             first_seen=self.first_seen(row).copy(),
             surface=self.surface_share(row),
         )
@@ -256,17 +241,19 @@ class ViewpointTask:
             self.position[rows] = after
         return collided
 
-    def _capture(self) -> Shown:
-        """What the newest views of all agents show; their new cells are marked."""
+    def _shown(self, rows: Rows, sense: Callable[[_Room, Rows], Shown]) -> Shown:
+        """What the newest views of some agents show, as `sense` finds it for those in one room."""
         if len(self._rooms) == 1:
-            room = self._rooms[0]
-            return room.sensor.capture(self._views(room.rows), self._first_seen, room.rows, self.steps)
-        whole = Shown(np.empty(self.agents), np.empty(self.agents), np.empty(self.agents, dtype=np.int64))
-        for room in self._rooms:
-            part = room.sensor.capture(self._views(room.rows), self._first_seen, room.rows, self.steps[room.rows])
-            for column in fields(Shown):
-                getattr(whole, column.name)[room.rows] = getattr(part, column.name)
+            return sense(self._rooms[0], rows)
+        least, mean = np.empty((2, len(rows)))
+        whole = Shown(least, mean, np.empty(len(rows), dtype=np.int64))
+        for room, chosen in self._by_room(rows):
+            part = sense(room, rows[chosen])
+            whole.least[chosen], whole.mean[chosen], whole.new_cells[chosen] = part.least, part.mean, part.new_cells
         return whole
+
+    def _capture(self, room: _Room, rows: Rows) -> Shown:
+        return room.sensor.capture(self._views(rows), self._first_seen, rows, self.steps[rows])
 
     def _capture_surface(self) -> NDArray[np.float64]:
         """`(n,)` ΔS of the newest views; zeros where nothing needs it."""
@@ -277,22 +264,12 @@ class ViewpointTask:
         return gain
 
     def _facts(self, actions: NDArray[np.integer], new_cells: NDArray[np.integer], new_surface: Float) -> StepFacts:
-        constants = self.settings.constants
-        past = motion.history(
-            self._path,
-            self._angles,
-            self._cell,
-            self.steps,
-            distance_m=constants.redundancy_distance_m,
-            angle_rad=float(np.radians(constants.redundancy_angle_deg)),
-        )
+        past = motion.history(self._path, self._angles, self._cell, self.steps, self.settings.constants)
         return StepFacts(
             new_cells=new_cells,
             new_surface=new_surface,
-            earlier_visits=past.earlier_visits,
-            spread_m=past.spread_m,
+            **past._asdict(),
             collided=self._collided,
-            redundant=past.redundant,
             stop_chosen=(actions == STOP) & has_stop(self._reward),
             coverage=self.coverage,
             steps_left=self.settings.budget - self.steps,
@@ -317,34 +294,18 @@ class ViewpointTask:
         return self.kind(agents)
 
     def _scenes(self, rows: Rows) -> list[SceneAgents]:
-        return [
-            SceneAgents(
-                simulator=room.simulator,
-                chosen=chosen,
-                views=self._views(rows[chosen]),
-                _rows=rows[chosen],
-                _first_seen=self._first_seen,
-                _floor=room.floor,
-                _surface=room.surface,
-            )
-            for room, chosen in self._by_room(rows)
-        ]
+        scenes = []
+        for room, chosen in self._by_room(rows):
+            there = rows[chosen]
+            views = self._views(there)
+            scenes.append(SceneAgents(room.simulator, chosen, views, there, self._first_seen, room.floor, room.surface))
+        return scenes
 
-    def _record(
-        self, actions: NDArray[np.integer], reward: Float, parts: dict[str, NDArray[np.float64]], facts: StepFacts
-    ) -> None:
+    def _record(self, actions: NDArray, reward: NDArray, parts: dict[str, NDArray], facts: StepFacts) -> None:
         now = (self._everyone, self.steps - 1)
-        columns = {
-            "action": actions,
-            "reward": reward,
-            "coverage": facts.coverage,
-            "collided": facts.collided,
-            "redundant": facts.redundant,
-        }
+        columns = {"action": actions, "reward": reward, "coverage": facts.coverage}
+        columns |= {"collided": facts.collided, "redundant": facts.redundant}
         for name, values in columns.items():
             self._log[name][now] = values
-        for name in parts:
-            if name not in self._parts:
-                self._parts[name] = np.zeros((self.agents, self.settings.budget))
-        for name, column in self._parts.items():
-            column[now] = parts.get(name, 0.0)
+        for name in dict.fromkeys([*self._parts, *parts]):
+            self._parts[name][now] = parts.get(name, 0.0)

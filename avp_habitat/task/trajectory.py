@@ -43,17 +43,7 @@ class Trajectory:
 
 
 def episode_metrics(trajectory: Trajectory, *, stopped: bool, further: Sequence[Any] = ()) -> dict[str, float]:
-    """Figures of one finished episode, by the keys of `info["avp_episode"]`.
-
-    Args:
-        trajectory: of the whole episode.
-        stopped: whether the agent ended it with enough coverage.
-        further: metrics of the user, as `TaskSettings.metrics`.
-
-    Returns:
-        coverage, views, annd_m, ei, path_length_m, collisions, redundant_views, stopped, `return_PART` for each part of
-        the reward, surface where it was computed, and those of the further metrics.
-    """
+    """Figures of one finished episode, which the agent itself stopped or not, and those of `TaskSettings.metrics`."""
     surface = {} if trajectory.surface is None else {"surface": trajectory.surface}
     views = len(trajectory.action)
     coverage = float(trajectory.coverage[-1]) if views else 0.0
