@@ -20,9 +20,8 @@ from avp_habitat.tracking.experiments import DEFAULT_HELP
 from avp_habitat.tracking.stores import DEFAULT_ADDRESS, about_run, address_of, open_store
 
 if TYPE_CHECKING:
-    from avp_habitat.tracking.run import TrackedRun
     from avp_nerfstudio.method.checkpoints import TrainedRun
-    from avp_nerfstudio.tracking.trackers import ReconstructionRecording
+    from avp_nerfstudio.recording import ReconstructionRecording
 
 TABLE = "heldout.json"
 _EXPERIMENT = (
@@ -149,12 +148,11 @@ def _track(
     scores: dict[str, float],
     files: Sequence[Path],
 ) -> None:
-    from avp_nerfstudio.tracking.mlflow import facts_of, open_again
-    from avp_nerfstudio.tracking.trackers import read_events
+    from avp_nerfstudio.tracking import facts_of, open_again, read_events
 
     folder = config.parent
     run, had_one = open_again(address, facts_of(trained.config), folder=folder, experiment=experiment)
-    with _failed_unless_done(run):
+    try:
         if not had_one:
             for name, value, step, seconds in read_events(trained.config, folder):
                 run.metrics({name: value}, step, timestamp_ms=int(1000 * seconds))
@@ -163,16 +161,10 @@ def _track(
             run.file(path)
         for path in files:
             run.file(path, f"heldout/{path.name}")
-    print(about_run(run.run_id, address, delivered=run.close("FINISHED")))
-
-
-@contextlib.contextmanager
-def _failed_unless_done(run: "TrackedRun") -> Iterator[None]:
-    try:
-        yield
     except BaseException as error:
         run.close("KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED")
         raise
+    print(about_run(run.run_id, address, delivered=run.close("FINISHED")))
 
 
 @contextlib.contextmanager
@@ -180,7 +172,8 @@ def _recording(path: Path | None, trained: "TrainedRun", folder: Path) -> "Itera
     if path is None:
         yield None
         return
-    from avp_nerfstudio.tracking.trackers import ReconstructionRecording, read_events
+    from avp_nerfstudio.recording import ReconstructionRecording
+    from avp_nerfstudio.tracking import read_events
 
     with contextlib.closing(ReconstructionRecording(path, trained.pipeline)) as recording:
         for name, value, step, _ in read_events(trained.config, folder):

@@ -34,13 +34,13 @@ from avp_habitat.provenance import installed_versions
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.format import Rollout
 from avp_habitat.task.settings import TaskSettings
+from avp_nerfstudio.check import Verdict
 from avp_nerfstudio.check.depth_maps import DepthMaps, load_depth_maps
 from avp_nerfstudio.check.geometry import check_geometry
 from avp_nerfstudio.check.pictures.evidence import judge
 from avp_nerfstudio.check.pictures.matching import Matches, match_pictures
 from avp_nerfstudio.check.pictures.rays import RelativePoses, estimate_relative_poses
 from avp_nerfstudio.check.shape import check_format
-from avp_nerfstudio.check.verdict import Verdict
 
 ROOT = Path(__file__).resolve().parent.parent
 POLICIES = ("heuristic", "random", "spin", "frontier", "greedy", "survey")

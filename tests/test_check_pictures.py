@@ -1,4 +1,5 @@
 import re
+import tempfile
 from dataclasses import replace
 
 import numpy as np
@@ -71,8 +72,8 @@ FAULTS = {
     "flip": (habitat_to_opencv(POSES), CAMERA, "y and z flipped"),
     "transposed": (transposed(POSES), CAMERA, "rotations look transposed"),
     "inverse": (np.linalg.inv(POSES), CAMERA, "look like world_to_camera: expected"),
-    "long focal length": (POSES, replace(CAMERA, fx=164.8, fy=164.8), r"focal length looks [23]\.\d % too long"),
-    "short focal length": (POSES, replace(CAMERA, fx=155.2, fy=155.2), r"focal length looks [23]\.\d % too short"),
+    "long focal length": (POSES, replace(CAMERA, fx=164.8, fy=164.8), r"focal length is [23]\.\d % too long"),
+    "short focal length": (POSES, replace(CAMERA, fx=155.2, fy=155.2), r"focal length is [23]\.\d % too short"),
     "sides swapped": (POSES, replace(CAMERA, cx=CAMERA.cy, cy=CAMERA.cx), "width and height look swapped"),
     "sides and focal length": (POSES, replace(CAMERA, fx=120, fy=120, cx=120, cy=160), "width and height look swapped"),
     "two exchanged": (exchanged(POSES, 4, 9), CAMERA, "frames 4 and 9 look exchanged"),
@@ -154,9 +155,9 @@ def test_a_damaged_picture_is_named(tmp_path):
         check_pictures(read_rollout(tmp_path / "broken"), progress=False)
 
 
-def test_the_temporary_files_are_removed(walk, tmp_path):
-    short = replace(walk, frames=walk.frames[:3])
-    check_pictures(short, workdir=tmp_path, progress=False)
+def test_the_temporary_files_are_removed(walk, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    check_pictures(replace(walk, frames=walk.frames[:3]), progress=False)
     assert list(tmp_path.iterdir()) == []
 
 

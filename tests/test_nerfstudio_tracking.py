@@ -23,7 +23,7 @@ from avp_habitat.tracking import deliver
 from avp_habitat.tracking.journal import spool_folder
 from avp_nerfstudio.data.refusals import CommandError
 from avp_nerfstudio.method.trainer import AVPTrainer
-from avp_nerfstudio.tracking.mlflow import Facts, open_again, open_run, remembered_id
+from avp_nerfstudio.tracking import Facts, open_again, open_run, remembered_id
 
 TINY = ["--pipeline.datamanager.train-num-rays-per-batch", 64, "--pipeline.model.log2-hashmap-size", 8]
 OFTEN = ["--logging.steps-per-log", 5, "--logging.local-writer.enable", "False", "--steps-per-save", 20]

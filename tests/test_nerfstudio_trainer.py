@@ -17,7 +17,7 @@ from rrd import entities, rows, verify
 from avp_habitat.errors import AVPError
 from avp_nerfstudio.data.refusals import CommandError
 from avp_nerfstudio.method.trainer import AVPTrainer, AVPTrainerConfig
-from avp_nerfstudio.tracking.mlflow import facts_of, open_run, remembered_id, rollout_folders
+from avp_nerfstudio.tracking import facts_of, open_run, remembered_id, rollout_folders
 
 
 @pytest.fixture

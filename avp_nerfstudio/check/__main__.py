@@ -15,18 +15,12 @@ from avp_habitat.rollout.format import Rollout
 from avp_habitat.scenes.loader import Scene, load_scene
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.scenes.location import UPS, locate
-from avp_nerfstudio.check.outputs import choose_folder, outputs_of_geometry, write_outputs
-from avp_nerfstudio.check.shape import check_format
-from avp_nerfstudio.check.verdict import Verdict
+from avp_nerfstudio.check import Verdict
 from avp_nerfstudio.data.refusals import check_is_rollout
 
 
 class CheckFailedError(AVPError):
     """A rollout that does not pass."""
-
-
-class MissingPackageError(AVPError):
-    """A package without which a check cannot run."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +63,12 @@ def check(options: Check) -> tuple[list[Verdict], Path]:
 
     Raises:
         UsageError: the mesh is no scene file, or the results' folder is not one of a check.
-        AVPError: the scene cannot be read, the results cannot be written, or a package is missing.
+        AVPError: the scene cannot be read, or the results cannot be written.
     """
+    from avp_nerfstudio.check.geometry import check_geometry
+    from avp_nerfstudio.check.outputs import choose_folder, outputs_of, write_outputs
+    from avp_nerfstudio.check.shape import check_format
+
     out = choose_folder(options.rollout, options.out)
     if options.mesh is not None:
         locate(options.mesh, up=options.up)
@@ -79,14 +77,12 @@ def check(options: Check) -> tuple[list[Verdict], Path]:
         write_outputs(out, options.rollout, [verdict], {})
         return [verdict], out
     scene = None if options.mesh is None else _scene_of(rollout, options.mesh, options.up)
-    from avp_nerfstudio.check.geometry import check_geometry
-
     with progress(total=len(rollout.frames) + len(rollout.heldout), unit="view", desc="comparing depth") as bar:
         geometry = check_geometry(rollout, scene, progress=bar.update)
     if not verdict.passed and geometry.diagnosis is not None:
         verdict = replace(verdict, cause=geometry.diagnosis.cause)
     verdicts = [verdict, *geometry.verdicts, *_pictures(rollout, options, geometry.proved)]
-    write_outputs(out, options.rollout, verdicts, outputs_of_geometry(rollout, geometry, verdicts))
+    write_outputs(out, options.rollout, verdicts, outputs_of(rollout, geometry, verdicts))
     return verdicts, out
 
 
@@ -105,18 +101,15 @@ def _pictures(rollout: Rollout, options: Check, proved: Any) -> list[Verdict]:
     """
     if options.no_pictures and options.export_colmap is None:
         return []
-    try:
-        from avp_nerfstudio.check.colmap import export_colmap
-        from avp_nerfstudio.check.pictures.evidence import check_pictures
-        from avp_nerfstudio.check.pictures.matching import match_pictures
-    except ImportError as error:
-        raise MissingPackageError(
-            f"checking the pictures needs {error.name}: pip install {error.name}, or leave it out with --no-pictures"
-        ) from None
+    from avp_nerfstudio.check.colmap import export_colmap
+    from avp_nerfstudio.check.pictures.evidence import check_pictures
+    from avp_nerfstudio.check.pictures.matching import match_pictures
+
     matches = match_pictures(rollout)
     verdicts = [] if options.no_pictures else check_pictures(rollout, matches=matches, proved=proved)
     if options.export_colmap is not None:
-        print(f"COLMAP model: {export_colmap(rollout, options.export_colmap, matches=matches)}")
+        export_colmap(rollout, options.export_colmap, matches=matches)
+        print(f"COLMAP model: {options.export_colmap}")
     return verdicts
 
 

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from avp_habitat.poses import Intrinsics, project
 from avp_nerfstudio.check.depth_maps import DepthMaps
-from avp_nerfstudio.check.hypotheses import Cameras
 
 Float = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -17,6 +16,25 @@ TOLERANCE_M = 0.02
 """Depths this close agree, metres."""
 NEIGHBOURS = 4
 """Frames before and after in time that every frame is compared with."""
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Poses and intrinsics as they are believed to be."""
+
+    poses: Float
+    """`(n, 4, 4)` camera_to_world, habitat axes; first the captured frames in order, then the held-out views."""
+    intrinsics: Intrinsics
+    """Of all n."""
+    captured: int
+    """How many of the n are captured frames."""
+    kept: Mask
+    """`(n,)` those of which something is believed."""
+
+    def select(self, group: str) -> Mask:
+        """`(n,)` the members of a group: "all", "captured" or "held-out"."""
+        captured = np.arange(len(self.poses)) < self.captured
+        return {"all": captured | True, "captured": captured, "held-out": ~captured}[group]
 
 
 @dataclass(frozen=True)
@@ -48,19 +66,23 @@ class Agreement:
     deviation_m: Float
     """`(t, k)` sum over the agreeing points of the absolute difference in metres."""
 
-    def share(self, kept: Mask | None = None) -> float:
-        """Share of the comparable points that agree, among the `(n,)` kept frames; NaN when there is none."""
-        compared = self.compared(kept)
-        return float((self.agreeing * self._between(kept)).sum() / compared) if compared else float("nan")
+    def among(self, kept: Mask) -> "Agreement":
+        """What `(n,)` kept frames say of each other."""
+        between = kept[self.pairs.sources] & kept[self.pairs.targets][:, None]
+        counts = (self.agreeing, self.contradicting, self.deviation_m)
+        return Agreement(self.pairs, *(count * between for count in counts))
 
-    def score(self, kept: Mask | None = None) -> float:
+    def compared(self) -> int:
+        """Number of comparable points."""
+        return int((self.agreeing + self.contradicting).sum())
+
+    def share(self) -> float:
+        """Share of the comparable points that agree; NaN when there is none."""
+        return float(self.agreeing.sum() / self.compared()) if self.compared() else float("nan")
+
+    def score(self) -> float:
         """Number of agreeing points times their share: poses under which hardly anything is comparable score low."""
-        agreeing, compared = float((self.agreeing * self._between(kept)).sum()), self.compared(kept)
-        return agreeing**2 / compared if compared else 0.0
-
-    def compared(self, kept: Mask | None = None) -> int:
-        """Number of comparable points among the `(n,)` kept frames."""
-        return int(((self.agreeing + self.contradicting) * self._between(kept)).sum())
+        return float(self.agreeing.sum()) ** 2 / max(self.compared(), 1)
 
     def mean_deviation_m(self) -> float:
         """Mean absolute difference of the points that agree, metres."""
@@ -72,10 +94,7 @@ class Agreement:
         return float(clipped / max(self.compared(), 1))
 
     def per_frame(self, kept: Mask) -> tuple[Float, Index]:
-        """Share of agreeing points of each frame's pairs with the kept frames, as source and as target.
-
-        Args:
-            kept: `(n,)` frames that may judge others.
+        """Share of agreeing points of each frame's pairs with the `(n,)` kept frames, as source and as target.
 
         Returns:
             `(n,)` shares, NaN without a comparable point, and `(n,)` numbers of comparable points.
@@ -83,11 +102,6 @@ class Agreement:
         agreeing, compared = self._sums(self.agreeing, kept), self._sums(self.agreeing + self.contradicting, kept)
         with np.errstate(invalid="ignore"):
             return agreeing / compared, compared
-
-    def _between(self, kept: Mask | None) -> Mask:
-        if kept is None:
-            return np.ones(self.pairs.sources.shape, bool)
-        return kept[self.pairs.sources] & kept[self.pairs.targets][:, None]
 
     def _sums(self, counts: Index, kept: Mask) -> Index:
         targets, sources = self.pairs.targets, self.pairs.sources
@@ -98,9 +112,7 @@ class Agreement:
 
 
 def choose_pairs(count: int, *, partners: int, points: int, targets: int | None = None) -> Pairs:
-    """Pair frames with their neighbours in time and with others spread over the whole rollout.
-
-    The choice does not depend on the poses, which may be wrong.
+    """Pair frames with their neighbours in time and with others spread over the whole rollout, whatever the poses are.
 
     Args:
         count: number of frames.
@@ -118,18 +130,9 @@ def choose_pairs(count: int, *, partners: int, points: int, targets: int | None 
     return Pairs(chosen, (chosen[:, None] + offsets) % count, points)
 
 
-def compare(
-    maps: DepthMaps, poses: Float, intrinsics: Intrinsics, pairs: Pairs, *, tolerance_m: float = TOLERANCE_M
-) -> Agreement:
-    """Look for points of some frames in other frames' depth.
-
-    Args:
-        maps: the depth.
-        poses: `(n, 4, 4)` camera_to_world, habitat axes, believed.
-        intrinsics: of the whole pictures, believed.
-        pairs: who is compared with whom.
-        tolerance_m: differences in depth up to this agree, metres.
-    """
+def compare(maps: DepthMaps, cameras: Cameras, pairs: Pairs, *, tolerance_m: float = TOLERANCE_M) -> Agreement:
+    """Look for points of some frames in other frames' depth; differences up to the tolerance agree."""
+    poses, intrinsics = cameras.poses, cameras.intrinsics
     camera = maps.camera(intrinsics)
     used, sources_in_world = np.unique(pairs.sources, return_inverse=True)
     sources_in_world = sources_in_world.reshape(pairs.sources.shape)
@@ -172,30 +175,23 @@ class Comparison:
 
     def full(self, cameras: Cameras) -> Agreement:
         """Agreement of all frames."""
-        return compare(self.maps, cameras.poses, cameras.intrinsics, self.all_pairs)
+        return compare(self.maps, cameras, self.all_pairs)
 
-    def quick(self, cameras: Cameras, *, tolerance_m: float = 0.02) -> float:
-        """Score on few pairs, by which hypotheses are ranked: `score` of all kept frames."""
-        found = compare(self.maps, cameras.poses, cameras.intrinsics, self.few_pairs, tolerance_m=tolerance_m)
-        return found.score(cameras.kept)
+    def quick(self, cameras: Cameras, *, tolerance_m: float = TOLERANCE_M) -> float:
+        """Score of the kept frames on few pairs, by which mistakes are ranked."""
+        return compare(self.maps, cameras, self.few_pairs, tolerance_m=tolerance_m).among(cameras.kept).score()
 
-    def some(self, cameras: Cameras, targets: list[int], sources: NDArray[np.int64]) -> Agreement:
-        """Agreement of the points of some frames with the depth of a few others."""
-        rows = [np.resize(sources[sources != target], len(sources)) for target in targets]
-        pairs = Pairs(np.array(targets), np.stack(rows), _POINTS_OF_SOME)
-        return compare(self.maps, cameras.poses, cameras.intrinsics, pairs)
+    def some(self, cameras: Cameras, target: int, sources: Index) -> Agreement:
+        """Agreement of the points of some frames with the depth of another."""
+        pairs = Pairs(np.array([target]), sources[None, sources != target], _POINTS_OF_SOME)
+        return compare(self.maps, cameras, pairs)
 
 
 def bad_frames(agreement: Agreement, kept: Mask) -> Mask:
-    """Frames that disagree with the rest: the worst is put aside until those that remain agree.
+    """`(n,)` kept frames that disagree with the rest: the worst is put aside until those that remain agree.
 
-    Args:
-        agreement: of all.
-        kept: `(n,)` those to judge.
-
-    Returns:
-        `(n,)`; when a quarter is put aside and the rest still disagrees, the mistake is not one of single frames, and
-        all frames that disagree with all others are given.
+    When a quarter is put aside and the rest still disagrees, the mistake is not one of single frames, and all frames
+    that disagree with all others are given.
     """
     bad, trusted = np.zeros(len(kept), bool), kept.copy()
     while bad.sum() <= max(2, 0.25 * kept.sum()):
@@ -211,7 +207,7 @@ def bad_frames(agreement: Agreement, kept: Mask) -> Mask:
 
 def agrees(agreement: Agreement, kept: Mask) -> bool:
     """Whether the share of agreeing points keeps its limits, over all and for each frame."""
-    return not (agreement.share(kept) < AGREEING_SHARE or bad_frames(agreement, kept).any())
+    return not (agreement.among(kept).share() < AGREEING_SHARE or bad_frames(agreement, kept).any())
 
 
 def overlap(agreement: Agreement, count: int) -> NDArray[np.int64]:

@@ -40,11 +40,7 @@ def posed_model(
 ) -> pycolmap.Reconstruction:
     """A model without points: image i + 1 is the i-th name.
 
-    Args:
-        names: of the n pictures.
-        features: per picture `(k, 2)` pixels.
-        poses: `(n, 4, 4)` camera_to_world, habitat axes; the model's world is theirs.
-        intrinsics: of all pictures.
+    Features are `(k, 2)` pixels per picture, poses `(n, 4, 4)` camera_to_world, habitat axes, in the model's world.
     """
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(colmap_camera(intrinsics))
@@ -55,23 +51,16 @@ def posed_model(
     return model
 
 
-def triangulate(
-    matches: Matches, poses: NDArray[np.floating], intrinsics: Intrinsics, *, workdir: Path | None = None
-) -> pycolmap.Reconstruction:
-    """COLMAP's triangulation of the matches, the poses and the camera held fixed.
+def triangulate(matches: Matches, poses: NDArray[np.floating], intrinsics: Intrinsics) -> pycolmap.Reconstruction:
+    """COLMAP's triangulation of verified matches, the poses and the camera held fixed.
 
     COLMAP drops observations that are more than 4 px off; so wrong poses leave few points rather than large errors.
-
-    Args:
-        matches: verified ones.
-        poses: `(n, 4, 4)` camera_to_world, habitat axes, of the n pictures.
-        intrinsics: of all pictures.
-        workdir: where the temporary folder is made.
+    `(n, 4, 4)` camera_to_world, habitat axes, of the n pictures.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 2
     options.random_seed = 0
-    with quiet_colmap(), tempfile.TemporaryDirectory(dir=workdir, prefix="triangulation-") as scratch:
+    with quiet_colmap(), tempfile.TemporaryDirectory(prefix="triangulation-") as scratch:
         database = Path(scratch) / "database.db"
         model = posed_model(matches.names, matches.features, poses, intrinsics)
         _write_database(database, matches, model)
@@ -79,25 +68,21 @@ def triangulate(
 
 
 def _write_database(path: Path, matches: Matches, model: pycolmap.Reconstruction) -> None:
-    database = pycolmap.Database.open(path)
-    try:
-        with pycolmap.DatabaseTransaction(database):
-            for camera in model.cameras.values():
-                database.write_camera(camera, use_camera_id=True)
-            for rig in model.rigs.values():
-                database.write_rig(rig, use_rig_id=True)
-            for frame in model.frames.values():
-                database.write_frame(frame, use_frame_id=True)
-            for image in model.images.values():
-                database.write_image(image, use_image_id=True)
-                database.write_keypoints(image.image_id, matches.features[image.image_id - 1].astype(np.float32))
-            for pair in matches.pairs:
-                geometry = pycolmap.TwoViewGeometry(
-                    config=pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED, inlier_matches=pair.features
-                )
-                database.write_two_view_geometry(pair.first + 1, pair.second + 1, geometry)
-    finally:
-        database.close()
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        for camera in model.cameras.values():
+            database.write_camera(camera, use_camera_id=True)
+        for rig in model.rigs.values():
+            database.write_rig(rig, use_rig_id=True)
+        for frame in model.frames.values():
+            database.write_frame(frame, use_frame_id=True)
+        for image in model.images.values():
+            database.write_image(image, use_image_id=True)
+            database.write_keypoints(image.image_id, matches.features[image.image_id - 1].astype(np.float32))
+        for pair in matches.pairs:
+            geometry = pycolmap.TwoViewGeometry(
+                config=pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED, inlier_matches=pair.features
+            )
+            database.write_two_view_geometry(pair.first + 1, pair.second + 1, geometry)
 
 
 def export_colmap(
@@ -108,9 +93,9 @@ def export_colmap(
     matches: Matches | None = None,
     progress: bool = True,
 ) -> Path:
-    """Write a rollout's frames as a COLMAP model, poses and camera as given.
+    """Write a rollout's frames as a COLMAP model, poses and camera as given, into a new folder.
 
-    The folder holds `images/` (hard links where the disk allows it, else copies) and `colmap/sparse/0/` (binary), as
+    It holds `images/` (hard links where the disk allows it, else copies) and `colmap/sparse/0/` (binary), as
     `ns-train nerfacto colmap --data FOLDER` and `pycolmap.Reconstruction(FOLDER/colmap/sparse/0)` read them; image
     i + 1 is frame i, named like the rollout's file. COLMAP prescribes no world axes, so the model keeps the
     rollout's world: metres, Y up; mesh, rollout and model lie in one another. nerfstudio's parser turns it upright by
@@ -123,10 +108,7 @@ def export_colmap(
         points: triangulate points from the pictures, with tracks and colours. Without them, nerfstudio's parser needs
             `--load-3D-points False`.
         matches: of the rollout's pictures, where they are known already.
-        progress: show bars where the output is a terminal.
-
-    Returns:
-        The folder.
+        progress: show bars.
 
     Raises:
         UsageError: the folder exists.
@@ -158,22 +140,15 @@ def _write_model(rollout: Rollout, folder: Path, matches: Matches | None) -> Non
         names = [view.image.name for view in rollout.frames]
         model = posed_model(names, [np.empty((0, 2))] * len(names), poses, rollout.intrinsics)
     else:
-        model = triangulate(_of_all_frames(matches, rollout), poses, rollout.intrinsics, workdir=folder)
+        model = triangulate(_of_all_frames(matches, rollout), poses, rollout.intrinsics)
     model.write_binary(folder)
 
 
 def _of_all_frames(matches: Matches, rollout: Rollout) -> Matches:
     """The same matches, among all frames of the rollout: those that were not matched have no features."""
-    features = [np.empty((0, 2))] * len(rollout.frames)
-    for place, frame in enumerate(matches.frames):
-        features[frame] = matches.features[place]
-    return replace(
-        matches,
-        names=[view.image.name for view in rollout.frames],
-        frames=np.arange(len(rollout.frames)),
-        features=features,
-        pairs=[
-            replace(pair, first=int(matches.frames[pair.first]), second=int(matches.frames[pair.second]))
-            for pair in matches.pairs
-        ],
-    )
+    names, frames = [view.image.name for view in rollout.frames], matches.frames.tolist()
+    features = [np.empty((0, 2))] * len(names)
+    for frame, found in zip(frames, matches.features, strict=True):
+        features[frame] = found
+    pairs = [replace(pair, first=frames[pair.first], second=frames[pair.second]) for pair in matches.pairs]
+    return Matches(matches.folder, names, np.arange(len(names)), features, pairs)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.errors import RolloutError
 from avp_habitat.poses import Intrinsics, pixel_directions
 from avp_habitat.rollout.format import View
 from avp_habitat.rollout.images import read_depth
@@ -44,21 +43,9 @@ class DepthMaps:
         return len(self.inverse)
 
     def camera(self, intrinsics: Intrinsics) -> Intrinsics:
-        """The camera whose pixel centres are the grid's samples.
-
-        Args:
-            intrinsics: of the whole pictures; those of a hypothesis, or the rollout's own.
-        """
-        rows, columns = self.inverse.shape[1:]
-        s = self.stride
-        return Intrinsics(
-            columns,
-            rows,
-            intrinsics.fx / s,
-            intrinsics.fy / s,
-            (intrinsics.cx - 0.5) / s + 0.5,
-            (intrinsics.cy - 0.5) / s + 0.5,
-        )
+        """The camera whose pixel centres are the grid's samples, from that of the whole pictures."""
+        (rows, columns), s, k = self.inverse.shape[1:], self.stride, intrinsics
+        return Intrinsics(columns, rows, k.fx / s, k.fy / s, (k.cx - 0.5) / s + 0.5, (k.cy - 0.5) / s + 0.5)
 
     def local_points(self, intrinsics: Intrinsics, frames: NDArray[np.integer], count: int) -> Float:
         """`(m, min(p, count), 3)` points in metres of m frames, each in its own camera's habitat axes."""
@@ -68,13 +55,7 @@ class DepthMaps:
         return directions[samples] / np.maximum(inverse, 1e-3)[..., None]
 
     def surface(self, frame: int, pose: Float, intrinsics: Intrinsics, count: int = POINTS) -> tuple[Float, Float]:
-        """World points of one picture with their surface normals.
-
-        Args:
-            frame: which picture.
-            pose: `(4, 4)` camera_to_world, habitat axes, believed.
-            intrinsics: of the whole pictures, believed.
-            count: how many points, at most.
+        """At most `count` world points of one picture with their surface normals.
 
         Returns:
             `(m, 3)` metres and `(m, 3)` unit vectors, whose sense means nothing.
@@ -89,11 +70,7 @@ class DepthMaps:
         return point @ pose[:3, :3].T + pose[:3, 3], normal @ pose[:3, :3].T
 
     def look_up(self, frame: int, pixel: Float) -> tuple[Float, NDArray[np.bool_]]:
-        """Depth of one picture at places of the grid's camera.
-
-        Args:
-            frame: which picture.
-            pixel: `(m, 2)` coordinates of the grid's camera, sample centres at +0.5; any number, also NaN.
+        """Depth of one picture at `(m, 2)` pixels of the grid's camera, sample centres at +0.5; any number, also NaN.
 
         Returns:
             `(m,)` metres and `(m,)` whether there is a smooth surface there; elsewhere the depth means nothing.
@@ -116,12 +93,7 @@ class DepthMaps:
 def load_depth_maps(
     views: Sequence[View], intrinsics: Intrinsics, *, progress: Callable[[], object] = lambda: None
 ) -> DepthMaps:
-    """Decode and thin the depth of views, one at a time.
-
-    Args:
-        views: whose depth to read, at least one.
-        intrinsics: for the pictures' size.
-        progress: called after each picture.
+    """Decode and thin the depth of at least one view; `progress` is called after each.
 
     Raises:
         RolloutError: a depth picture cannot be decoded.
@@ -129,11 +101,7 @@ def load_depth_maps(
     stride = max(1, round(intrinsics.width / GRID_WIDTH))
     parts = []
     for index, view in enumerate(views):
-        try:
-            depth = read_depth(view.depth)
-        except (OSError, SyntaxError) as error:
-            raise RolloutError(f"{view.depth}: expected a PNG with depth, could not decode it: {error}") from None
-        parts.append(_thin(depth, stride, np.random.default_rng(index)))
+        parts.append(_thin(read_depth(view.depth), stride, np.random.default_rng(index)))
         progress()
     inverse, flat, samples, counts = (np.stack(values) for values in zip(*parts, strict=True))
     return DepthMaps(stride, inverse, flat, samples, counts)

@@ -1,30 +1,33 @@
 """The verdicts on depth and poses, with the mistake that explains a disagreement."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.rollout.format import Rollout
 from avp_habitat.scenes.loader import Scene
-from avp_nerfstudio.check import hypotheses
+from avp_nerfstudio.check import Verdict, mistakes
 from avp_nerfstudio.check.agreement import (
     AGREEING_SHARE,
     AGREEING_SHARE_OF_FRAME,
     LEAST_COMPARED,
     Agreement,
+    Cameras,
     Comparison,
     agrees,
     bad_frames,
     overlap,
 )
-from avp_nerfstudio.check.cloud import PARTNERS, Correction, mesh_distance, register
 from avp_nerfstudio.check.depth_maps import DepthMaps, load_depth_maps
-from avp_nerfstudio.check.hypotheses import Cameras
-from avp_nerfstudio.check.mistakes import Diagnosis, Walk, frame_mistake, mistake_with_a_part, mistake_with_all
-from avp_nerfstudio.check.verdict import Verdict
+from avp_nerfstudio.check.mistakes import Mistake, Walk, find_mistake
+from avp_nerfstudio.check.surfaces import Correction, mesh_distance, register
+
+Mask = NDArray[np.bool_]
+Corrections = dict[int, Correction | None]
+"""What ICP would do with the frames that were looked at; None where too little of a frame is seen by others."""
 
 CORRECTION_M = 0.005
 """Greatest shift by which ICP may still improve a frame; 0 in all correct rollouts that were tried."""
@@ -37,9 +40,10 @@ degree was left so in the rollouts that were tried, and a shift along what the s
 PROVED_SHARE = 0.95
 """What also agrees so much, and has surfaces that fix all six directions, no other check calls wrong."""
 _LEAST_GAIN_M = 0.0005
-_REGISTERED = 100
-_NAMED = 5
+_REGISTERED, _PARTNERS = 100, 8
 _FEW = 4
+_MOST_EXCHANGED = 12
+_NAMED, _MOST_NAMED = 5, 8
 
 
 @dataclass(frozen=True)
@@ -52,11 +56,11 @@ class Geometry:
     """The depth, thinned."""
     cameras: Cameras
     """The rollout's own."""
-    bad: NDArray[np.bool_]
+    bad: Mask
     """`(n,)` frames that disagree."""
-    proved: NDArray[np.bool_]
+    proved: Mask
     """`(n,)` frames whose poses are right: `PROVED_SHARE`."""
-    diagnosis: Diagnosis | None
+    diagnosis: Mistake | None
     """What explains the disagreement, where that is known."""
 
 
@@ -102,42 +106,77 @@ def check_geometry(
     proved = _left_by_icp(agreement, given, corrections, share=PROVED_SHARE, directions=6)
     if bad.sum() <= _FEW:
         bad &= ~_left_by_icp(agreement, given, corrections, share=SETTLED_SHARE, directions=1)
-    passed = not (agreement.share(given.kept) < AGREEING_SHARE or bad.any())
+    passed = not (agreement.share() < AGREEING_SHARE or bad.any())
     diagnosis = None if passed or not explain else _diagnose(comparison, given, rollout, bad, corrections)
     hidden = _hidden_mistakes(comparison, given) if passed and explain else []
-    verdicts = [
-        _agreement_verdict(given, agreement, bad, passed, hidden),
-        _correction_verdict(given, corrections),
-    ]
+    verdicts = [_agreement_verdict(given, agreement, bad, passed, hidden), _correction_verdict(given, corrections)]
     if scene is not None:
         named = rollout.meta.get("scene")
-        measured = mesh_distance(maps, given, scene, named=named.get("sha256") if isinstance(named, dict) else None)
-        verdicts.append(measured.verdict)
-        bad = bad | measured.bad
+        digest = named.get("sha256") if isinstance(named, dict) else None
+        verdict, far = mesh_distance(maps, given, scene, named=digest)
+        verdicts.append(verdict)
+        bad = bad | far
     return Geometry([_with_cause(v, diagnosis, given, bad) for v in verdicts], maps, given, bad, proved, diagnosis)
 
 
 def _diagnose(
-    comparison: Comparison,
-    given: Cameras,
-    rollout: Rollout,
-    bad: NDArray[np.bool_],
-    corrections: dict[int, Correction | None],
-) -> Diagnosis | None:
+    comparison: Comparison, given: Cameras, rollout: Rollout, bad: Mask, corrections: Corrections
+) -> Mistake | None:
     walk = Walk.of(rollout.meta, given.poses[: given.captured])
-    numbers = np.flatnonzero(bad)
-    found = mistake_with_all(comparison, given, walk)
-    of_heldout = len(numbers) > 1 and bool((numbers >= given.captured).all())
-    if found is None and (len(numbers) > _FEW or of_heldout):
-        found = mistake_with_a_part(comparison, given, walk)
-    if found is None and 0 < len(numbers) <= max(_FEW, 0.25 * len(bad)):
-        found = frame_mistake(comparison, given, numbers, corrections=corrections, name=partial(name_of, given))
+    count, captured = int(bad.sum()), given.captured
+    found = find_mistake(comparison, given, walk)
+    of_heldout = count > 1 and not bad[:captured].any()
+    if found is None and 0 < captured < len(bad) and (count > _FEW or of_heldout):
+        found = find_mistake(comparison, given, walk, ("captured", "held-out"))
+    if found is None and 0 < count <= max(_FEW, 0.25 * len(bad)):
+        found = _exchanged(comparison, given, bad) or _off(given, np.flatnonzero(bad).tolist(), corrections)
     return found
 
 
+def _exchanged(comparison: Comparison, given: Cameras, bad: Mask) -> Mistake | None:
+    """Two poses, one of them of a frame that disagrees, with which all frames agree once they are exchanged."""
+    others = np.flatnonzero(~bad)
+    for pair in _pairs(np.flatnonzero(bad).tolist(), len(bad)):
+        poses = given.poses.copy()
+        poses[list(pair)] = given.poses[list(reversed(pair))]
+        cameras = replace(given, poses=poses)
+        found = [comparison.some(cameras, frame, others) for frame in pair]
+        both = all(one.compared() >= LEAST_COMPARED and one.share() >= AGREEING_SHARE_OF_FRAME for one in found)
+        if both and agrees(comparison.full(cameras), given.kept):
+            names = " and ".join(name_of(given, frame) for frame in pair)
+            return Mistake(f"the poses of {names} are exchanged", cameras)
+    return None
+
+
+def _pairs(bad: list[int], count: int) -> Iterator[tuple[int, int]]:
+    """Pairs of frames that may have been exchanged; a single bad frame with any other."""
+    if len(bad) == 1:
+        yield from ((min(bad[0], other), max(bad[0], other)) for other in range(count) if other != bad[0])
+    elif len(bad) <= _MOST_EXCHANGED:
+        yield from combinations(bad, 2)
+
+
+def _off(given: Cameras, bad: list[int], corrections: Corrections) -> Mistake:
+    parts, poses = [], given.poses.copy()
+    for frame in bad[:_MOST_NAMED]:
+        name, correction = name_of(given, frame), corrections.get(frame)
+        if correction is None or not correction.distance_m + correction.rotation_deg:
+            parts.append(f"{name} does not fit the others")
+            continue
+        poses[frame] = correction.camera_to_world
+        x, y, z = -1000 * correction.shift_m
+        parts.append(
+            f"the pose of {name} is off by {1000 * correction.distance_m:.0f} mm (x {x:+.0f}, y {y:+.0f}, z {z:+.0f}) "
+            f"and {correction.rotation_deg:.1f} degrees"
+        )
+    more = len(bad) - _MOST_NAMED
+    text = "; ".join(parts) + (f"; and {more} more" if more > 0 else "")
+    return Mistake(f"{text}; all other frames agree", replace(given, poses=poses))
+
+
 def _left_by_icp(
-    agreement: Agreement, given: Cameras, corrections: dict[int, Correction | None], *, share: float, directions: int
-) -> NDArray[np.bool_]:
+    agreement: Agreement, given: Cameras, corrections: Corrections, *, share: float, directions: int
+) -> Mask:
     """`(n,)` frames that ICP, with so many directions fixed, does not move, and of which such a share agrees."""
     agreeing, compared = agreement.per_frame(given.kept)
     left = np.zeros(len(given.poses), bool)
@@ -150,18 +189,15 @@ def _small(correction: Correction) -> bool:
     return correction.distance_m <= CORRECTION_M and correction.rotation_deg <= CORRECTION_DEG
 
 
-def _corrections(
-    comparison: Comparison, given: Cameras, agreement: Agreement, bad: NDArray[np.bool_]
-) -> dict[int, Correction | None]:
-    """What ICP would do with each frame that is looked at; None where too little of it is seen by others."""
+def _corrections(comparison: Comparison, given: Cameras, agreement: Agreement, bad: Mask) -> Corrections:
     n = len(given.poses)
     table = overlap(agreement, n) * ~bad
     spread = np.linspace(0, n - 1, min(n, _REGISTERED)).round().astype(int)
-    found: dict[int, Correction | None] = {}
-    for frame in np.union1d(spread, np.flatnonzero(bad)[:_REGISTERED]):
-        partners = np.argsort(-table[frame], kind="stable")[:PARTNERS]
+    found: Corrections = {}
+    for frame in np.union1d(spread, np.flatnonzero(bad)[:_REGISTERED]).tolist():
+        partners = np.argsort(-table[frame], kind="stable")[:_PARTNERS]
         partners = partners[table[frame, partners] > 0]
-        found[int(frame)] = _correction(comparison, given, int(frame), partners, far=bool(bad[frame]))
+        found[frame] = _correction(comparison, given, frame, partners, far=bool(bad[frame])) if len(partners) else None
     return found
 
 
@@ -169,25 +205,22 @@ def _correction(
     comparison: Comparison, given: Cameras, frame: int, partners: NDArray[np.int64], *, far: bool
 ) -> Correction | None:
     """ICP's correction where it makes the frame agree better; else none, whatever ICP says."""
-    if not len(partners):
-        return None
-    # What is far off for another reason than its pose, as leaves between the pixels, can still be held to what is near.
     correction = register(comparison.maps, given, frame, partners, far=far)
     if correction is None and far:
+        # What is far off for another reason than its pose, as leaves between the pixels, can still be held to what is
+        # near.
         correction = register(comparison.maps, given, frame, partners, far=False)
     if correction is None:
         return None
     poses = given.poses.copy()
     poses[frame] = correction.camera_to_world
-    before, after = (comparison.some(c, [frame], partners).cost_m() for c in (given, replace(given, poses=poses)))
+    before, after = (comparison.some(c, frame, partners).cost_m() for c in (given, replace(given, poses=poses)))
     if before - after >= _LEAST_GAIN_M:
         return correction
-    return Correction(np.zeros(3), 0.0, given.poses[frame], correction.fixed_directions)
+    return replace(correction, shift_m=np.zeros(3), rotation_deg=0.0, camera_to_world=given.poses[frame])
 
 
-def _agreement_verdict(
-    given: Cameras, agreement: Agreement, bad: NDArray[np.bool_], passed: bool, hidden: list[str]
-) -> Verdict:
+def _agreement_verdict(given: Cameras, agreement: Agreement, bad: Mask, passed: bool, hidden: list[str]) -> Verdict:
     share, compared = agreement.per_frame(given.kept)
     judged = compared >= LEAST_COMPARED
     figures = {
@@ -216,15 +249,15 @@ def _agreement_verdict(
 def _hidden_mistakes(comparison: Comparison, given: Cameras) -> list[str]:
     """Mistakes that would agree as well, because of how the cameras stand: turning in place hides the scale."""
     tried = {
-        "a scale that is wrong by 10 %": [hypotheses.scale_factor(given, 1.1)],
-        "a focal length that is wrong by 3 %": [hypotheses.focal_factor(given, 1.03)],
-        "a time shift of one frame": list(hypotheses.time_shifts(given))[:1],
-        "a wrong convention of the matrices": list(hypotheses.conventions(given, "all")),
+        "a scale that is wrong by 10 %": [mistakes.scale_factor(given, 1.1)],
+        "a focal length that is wrong by 3 %": [mistakes.focal_factor(given, 1.03)],
+        "a time shift of one frame": list(mistakes.time_shifts(given))[:1],
+        "a wrong convention of the matrices": list(mistakes.conventions(given)),
     }
     found = []
     for text, wrong in tried.items():
-        changed = [h for h in wrong if _differ(h.cameras, given)]
-        if not changed or any(agrees(comparison.full(h.cameras), h.cameras.kept) for h in changed):
+        changed = [mistake.cameras for mistake in wrong if _differ(mistake.cameras, given)]
+        if not changed or any(agrees(comparison.full(cameras), cameras.kept) for cameras in changed):
             found.append(text)
     return found
 
@@ -236,7 +269,7 @@ def _differ(a: Cameras, b: Cameras) -> bool:
     return a.intrinsics != b.intrinsics or float(np.abs(shifted - b.poses).max()) > 1e-4
 
 
-def _correction_verdict(given: Cameras, corrections: dict[int, Correction | None]) -> Verdict:
+def _correction_verdict(given: Cameras, corrections: Corrections) -> Verdict:
     found = {frame: c for frame, c in corrections.items() if c is not None}
     if not found:
         return Verdict("ICP correction", True, "no frame could be registered to others")
@@ -258,7 +291,7 @@ def _correction_verdict(given: Cameras, corrections: dict[int, Correction | None
     return Verdict("ICP correction", not wrong, text, figures)
 
 
-def _with_cause(verdict: Verdict, diagnosis: Diagnosis | None, given: Cameras, bad: NDArray[np.bool_]) -> Verdict:
+def _with_cause(verdict: Verdict, diagnosis: Mistake | None, given: Cameras, bad: Mask) -> Verdict:
     if verdict.passed or verdict.cause:
         return verdict
     if diagnosis is not None:

@@ -1,32 +1,37 @@
 """The folder that a check leaves: never inside the rollout, never over files of somebody else."""
 
-import io
 import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
-from PIL import Image
 
 from avp_habitat.errors import RolloutError, UsageError
 from avp_habitat.files import atomic_file
+from avp_habitat.poses import Intrinsics, pixel_directions
 from avp_habitat.provenance import installed_versions
 from avp_habitat.rollout.format import Rollout
-from avp_nerfstudio.check.cloud import Cloud, frusta, frustum_colours, fuse, write_ply
-from avp_nerfstudio.check.hypotheses import Cameras
-from avp_nerfstudio.check.verdict import Verdict
+from avp_habitat.rollout.images import read_rgb
+from avp_nerfstudio.check import Verdict
+from avp_nerfstudio.check.agreement import Cameras
+from avp_nerfstudio.check.geometry import Geometry
+
+Float = NDArray[np.floating]
 
 FORMAT = "avp-check"
 REPORT, PICTURE, CLOUD, RECORDING = "check.json", "overview.png", "cloud.ply", "check.rrd"
+BAD_COLOUR, GOOD_COLOUR = (255, 48, 48), (64, 160, 255)
+"""Of frames that disagree, and of all others."""
+_FRUSTUM_M = 0.2
 _VERSIONED = ("avp-suite", "numpy", "open3d", "pycolmap", "rerun-sdk", "matplotlib")
-_PICTURES = 200
-_PICTURE_WIDTH = 320
+_FRAMES, _POINTS_OF_A_FRAME = 400, 2400
+_PICTURES, _PICTURE_WIDTH = 200, 320
 _ABOVE_CAMERAS_M = 0.3
 _MOST_POINTS = 150_000
 _OUTLIERS = 0.5
@@ -35,116 +40,133 @@ _POINT = 4.0
 """Area of a point, square typographic points: so large that surfaces close and hide what lies behind them."""
 
 
-def draw_overview(path: Path, cloud: Cloud, cameras: Cameras, bad: NDArray[np.bool_], verdicts: list[Verdict]) -> None:
-    """Write the picture as PNG.
+class Cloud(NamedTuple):
+    """Coloured points."""
 
-    Args:
-        path: the file.
-        cloud: of the frames.
-        cameras: drawn as pyramids.
-        bad: `(n,)` those drawn red.
-        verdicts: named in the title.
+    points: Float
+    """`(m, 3)` metres, world frame."""
+    colours: NDArray[np.uint8]
+    """`(m, 3)` as photographed; those of frames that disagree are red."""
+
+
+def fuse(rollout: Rollout, geometry: Geometry) -> Cloud:
+    """Back-project some points of every frame; of more than 400 frames, of those that are spread evenly."""
+    maps, cameras, bad = geometry.maps, geometry.cameras, geometry.bad
+    views = rollout.frames + rollout.heldout
+    parts = []
+    for frame in np.union1d(_spread(len(views), _FRAMES), np.flatnonzero(bad)[:_FRAMES]):
+        points, _ = maps.surface(int(frame), cameras.poses[frame], cameras.intrinsics, _POINTS_OF_A_FRAME)
+        picture = read_rgb(views[frame].image)[:: maps.stride, :: maps.stride].reshape(-1, 3)
+        colours = picture[maps.samples[frame, : len(points)]]
+        parts.append((points, np.full_like(colours, BAD_COLOUR) if bad[frame] else colours))
+    return Cloud(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _spread(count: int, most: int) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
+
+
+def frusta(cameras: Cameras) -> Float:
+    """`(n, 11, 3)` one line per camera that draws its pyramid of view, metres, world frame."""
+    k = cameras.intrinsics
+    # A camera of 2x2 pixels whose centres are the corners of the picture.
+    corners = Intrinsics(2, 2, k.fx / k.width, k.fy / k.height, k.cx / k.width + 0.5, k.cy / k.height + 0.5)
+    tip_and_corners = np.concatenate([np.zeros((1, 3)), _FRUSTUM_M * pixel_directions(corners).reshape(4, 3)])
+    line = tip_and_corners[[0, 1, 2, 0, 4, 3, 0, 1, 3, 4, 2]]
+    return np.einsum("nij,kj->nki", cameras.poses[:, :3, :3], line) + cameras.poses[:, None, :3, 3]
+
+
+def _frustum_colours(bad: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    return np.where(bad[:, None], BAD_COLOUR, GOOD_COLOUR).astype(np.uint8)
+
+
+def write_ply(path: Path, cloud: Cloud) -> None:
+    """Write the cloud as binary PLY with Open3D.
+
+    Raises:
+        OSError: it could not be written.
     """
+    import open3d as o3d
+
+    written = o3d.geometry.PointCloud()
+    written.points = o3d.utility.Vector3dVector(cloud.points)
+    written.colors = o3d.utility.Vector3dVector(cloud.colours / 255)
+    if not o3d.io.write_point_cloud(str(path), written):  # pyright: ignore[reportArgumentType]
+        raise OSError(f"Open3D could not write {path.name}")
+
+
+def draw_overview(path: Path, cloud: Cloud, geometry: Geometry, verdicts: list[Verdict]) -> None:
+    """Draw the cloud and the cameras, as pyramids, from above and from the side; write it as PNG."""
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
+    cameras, bad = geometry.cameras, geometry.bad
     kept = np.random.default_rng(0).permutation(len(cloud.points))[:_MOST_POINTS]
     points, colours = cloud.points[kept], cloud.colours[kept] / 255
     centres = cameras.poses[:, :3, 3]
     # A ceiling would hide the room.
     below = points[:, 1] < centres[:, 1].max() + _ABOVE_CAMERAS_M
-    lines, line_colours = frusta(cameras), frustum_colours(bad) / 255
-    figure = Figure(figsize=(14, 6.5), layout="constrained")
     behind = points[:, 2] < np.median(centres[:, 2])
-    for axes, (across, along), towards, chosen, title in (
-        (*_pair(figure, 0), 1, below, "from above, without the ceiling"),
-        (*_pair(figure, 1), 2, behind, "from the side, without the nearer half"),
+    lines, line_colours = frusta(cameras), _frustum_colours(bad) / 255
+    figure = Figure(figsize=(14, 6.5), layout="constrained")
+    for place, down, towards, chosen, title in (
+        (1, 2, 1, below, "from above, without the ceiling"),
+        (2, 1, 2, behind, "from the side, without the nearer half"),
     ):
+        axes = figure.add_subplot(1, 2, place, facecolor=_GROUND)
         order = np.flatnonzero(chosen)[np.argsort(points[chosen, towards])]
-        axes.scatter(
-            points[order, across], points[order, along], s=_POINT, c=colours[order], linewidths=0, rasterized=True
-        )
-        axes.add_collection(LineCollection(list(lines[:, :, [across, along]]), colors=line_colours, linewidths=0.6))
+        axes.scatter(points[order, 0], points[order, down], s=_POINT, c=colours[order], linewidths=0, rasterized=True)
+        axes.add_collection(LineCollection(list(lines[:, :, [0, down]]), colors=line_colours, linewidths=0.6))
+        # Without the few points that fly far away when poses are wrong.
+        shown = np.concatenate([points[chosen], centres])[:, [0, down]]
+        low, high = np.percentile(shown, [_OUTLIERS, 100 - _OUTLIERS], axis=0)
+        (left, bottom), (right, top) = low - 0.08 * (high - low) - 0.1, high + 0.08 * (high - low) + 0.1
+        axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="x [m]", ylabel=f"{'xyz'[down]} [m]", title=title)
         axes.set_aspect("equal")
-        axes.set_xlabel(f"{'xyz'[across]} [m]")
-        axes.set_ylabel(f"{'xyz'[along]} [m]")
-        _limit(axes, np.concatenate([points[chosen], centres]), across, along)
-        axes.set_title(title)
+        if down == 2:  # as on a map
+            axes.invert_yaxis()
     failed = [verdict.name for verdict in verdicts if not verdict.passed]
     good, wrong = f"{(~bad).sum()} cameras agree (blue)", f"{bad.sum()} disagree (red)"
     figure.suptitle(f"{'FAILED: ' + ', '.join(failed) if failed else 'all checks passed'}; {good}, {wrong}")
     figure.savefig(path, format="png", dpi=110)
 
 
-def _pair(figure, column: int):
-    """The axes of a view and the two coordinates it shows; from above z points down, as on a map."""
-    axes = figure.add_subplot(1, 2, column + 1, facecolor=_GROUND)
-    if column == 0:
-        axes.invert_yaxis()
-    return axes, ((0, 2), (0, 1))[column]
-
-
-def _limit(axes, points: NDArray[np.floating], across: int, along: int) -> None:
-    """Leave out the few points that fly far away when poses are wrong."""
-    for axis, setter in ((across, axes.set_xlim), (along, axes.set_ylim)):
-        low, high = np.percentile(points[:, axis], [_OUTLIERS, 100 - _OUTLIERS])
-        margin = 0.08 * (high - low) + 0.1
-        limits = (low - margin, high + margin)
-        setter(limits[::-1] if axis == 2 else limits)
-
-
-def write_recording(path: Path, rollout: Rollout, cloud: Cloud, cameras: Cameras, bad: NDArray[np.bool_]) -> None:
+def write_recording(path: Path, rollout: Rollout, cloud: Cloud, geometry: Geometry) -> None:
     """Write an `.rrd` file.
 
     Entities: `world/cloud`, `world/frusta` (red where a frame disagrees), and on the time line `frame` the
     `world/camera` with its picture; of more than 200 frames, of those that are spread evenly.
 
-    Args:
-        path: the file.
-        rollout: for the pictures.
-        cloud: of the frames.
-        cameras: of the frames.
-        bad: `(n,)` those drawn red.
-
     Raises:
         OSError: it cannot be written.
     """
     path.touch()  # Rerun's own error for an unwritable path has neither the path nor an errno.
+    cameras, views = geometry.cameras, rollout.frames + rollout.heldout
     recording = rr.RecordingStream(FORMAT)
     recording.save(path, default_blueprint=_blueprint())
     try:
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
         recording.log("world/cloud", rr.Points3D(cloud.points, colors=cloud.colours, radii=[0.008]), static=True)
-        lines = rr.LineStrips3D(list(frusta(cameras)), colors=frustum_colours(bad), radii=[0.004])
+        lines = rr.LineStrips3D(list(frusta(cameras)), colors=_frustum_colours(geometry.bad), radii=[0.004])
         recording.log("world/frusta", lines, static=True)
-        views = rollout.frames + rollout.heldout
-        for frame in np.unique(np.linspace(0, len(views) - 1, min(len(views), _PICTURES)).round().astype(int)):
+        for frame in _spread(len(views), _PICTURES):
             recording.set_time("frame", sequence=int(frame))
-            _log_camera(recording, cameras, int(frame), views[frame].image)
+            _log_camera(recording, cameras.poses[frame], cameras.intrinsics, views[frame].image)
     finally:
         recording.disconnect()
 
 
-def _log_camera(recording: rr.RecordingStream, cameras: Cameras, frame: int, image: Path) -> None:
-    pose, k = cameras.poses[frame], cameras.intrinsics
-    with Image.open(image) as picture:
-        width = min(_PICTURE_WIDTH, k.width)
-        small = picture.convert("RGB").resize((width, max(1, round(k.height * width / k.width))))
-    encoded = io.BytesIO()
-    small.save(encoded, format="JPEG", quality=80)
-    across, down = small.width / k.width, small.height / k.height
-    matrix = k.matrix * np.array([[across], [down], [1.0]])
-    recording.log("world/camera", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
-    recording.log(
-        "world/camera/picture",
-        rr.Pinhole(
-            image_from_camera=matrix,
-            resolution=[small.width, small.height],
-            camera_xyz=rr.ViewCoordinates.RUB,
-            image_plane_distance=0.3,
-        ),
-        rr.EncodedImage(contents=encoded.getvalue(), media_type="image/jpeg"),
+def _log_camera(recording: rr.RecordingStream, pose: Float, intrinsics: Intrinsics, image: Path) -> None:
+    stride = max(1, round(intrinsics.width / _PICTURE_WIDTH))
+    picture = np.ascontiguousarray(read_rgb(image)[::stride, ::stride])
+    pinhole = rr.Pinhole(
+        image_from_camera=np.diag([1 / stride, 1 / stride, 1.0]) @ intrinsics.matrix,
+        resolution=[picture.shape[1], picture.shape[0]],
+        camera_xyz=rr.ViewCoordinates.RUB,
+        image_plane_distance=0.3,
     )
+    recording.log("world/camera", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+    recording.log("world/camera/picture", pinhole, rr.Image(picture).compress(jpeg_quality=80))
 
 
 def _blueprint() -> rrb.Blueprint:
@@ -209,25 +231,21 @@ def _write_report(path: Path, rollout: Path, verdicts: list[Verdict]) -> None:
         "format_version": 1,
         "rollout": rollout.resolve().name,
         "passed": all(verdict.passed for verdict in verdicts),
-        "verdicts": [as_json(verdict) for verdict in verdicts],
+        "verdicts": [asdict(verdict) | {"figures": _finite(verdict.figures)} for verdict in verdicts],
         "versions": installed_versions(_VERSIONED),
     }
     path.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def as_json(verdict: Verdict) -> dict[str, Any]:
-    """A verdict as JSON has it: figures that are not numbers become null."""
-    values = asdict(verdict)
-    values["figures"] = {name: value if math.isfinite(value) else None for name, value in verdict.figures.items()}
-    return values
+def _finite(figures: dict[str, float]) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in figures.items()}
 
 
-def outputs_of_geometry(rollout: Rollout, geometry: Any, verdicts: list[Verdict]) -> dict[str, Callable[[Path], None]]:
-    """What writes the picture, the cloud and the recording of a `Geometry`."""
-    cameras, bad = geometry.cameras, geometry.bad
-    cloud = fuse(rollout, geometry.maps, cameras, bad)
+def outputs_of(rollout: Rollout, geometry: Geometry, verdicts: list[Verdict]) -> dict[str, Callable[[Path], None]]:
+    """What writes the picture, the cloud and the recording."""
+    cloud = fuse(rollout, geometry)
     return {
-        PICTURE: lambda path: draw_overview(path, cloud, cameras, bad, verdicts),
+        PICTURE: lambda path: draw_overview(path, cloud, geometry, verdicts),
         CLOUD: lambda path: write_ply(path, cloud),
-        RECORDING: lambda path: write_recording(path, rollout, cloud, cameras, bad),
+        RECORDING: lambda path: write_recording(path, rollout, cloud, geometry),
     }

@@ -1,8 +1,6 @@
 """The format check: files, numbers and tables of a rollout agree with each other, and describe a walk."""
 
 import csv
-import json
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +8,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from avp_habitat.errors import RolloutError
 from avp_habitat.poses import opencv_to_habitat, wrap_angle, yaw_and_pitch, z_up_to_y_up
-from avp_habitat.rollout.format import Rollout, frame_name, read_json, read_rollout
-from avp_nerfstudio.check.verdict import Verdict, has_no_roll, is_upright
+from avp_habitat.rollout.format import Rollout, frame_name, read_json, read_meta, read_rollout
+from avp_nerfstudio.check import Verdict
+from avp_nerfstudio.check.mistakes import Walk, has_no_roll, is_upright, transposed
 
 Float = NDArray[np.floating]
+Fault = tuple[str, str | None]
+"""What was found, and the likely cause where one is known."""
 
 STEP_M = 0.002
 """Steps may be so much longer than a forward move; in correct rollouts they exceed it by less than 0.000002 m."""
@@ -26,6 +28,10 @@ ANGLE_RAD = 1e-4
 """Turns may differ so much from their amount; in correct rollouts by less than 0.000001."""
 TABLE_M = 2e-4
 """Positions in the table may differ so much from the poses (six decimals are written)."""
+_FOCAL_SHARE = 1e-4
+_POSE_M = 1e-6
+_SWAPPED = "width and height look swapped"
+_COLUMNS = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad")
 
 
 @dataclass(frozen=True)
@@ -66,27 +72,20 @@ def read_steps(path: Path, count: int) -> Steps | None:
     return Steps(actions, columns[:, :3], columns[:, 3], columns[:, 4])
 
 
-_COLUMNS = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad")
-
-
-def upright_fault(poses: Float, limit_deg: float, names: list[str]) -> tuple[str, str | None] | None:
+def upright_fault(poses: Float, limit_deg: float, names: list[str]) -> Fault | None:
     """What is wrong with how `(n, 4, 4)` cameras stand, and why perhaps; None when all are upright."""
     wrong = np.flatnonzero(~is_upright(poses, limit_deg=limit_deg))
     if not len(wrong):
         return None
     worst = int(wrong[0])
+    what = "rolled to the side"
     if has_no_roll(poses[[worst]])[0]:
-        down = poses[worst, 1, 1] < 0
-        what = "upside down" if down else f"pitched beyond {limit_deg:g} degrees"
-    else:
-        what = "rolled to the side"
+        what = "upside down" if poses[worst, 1, 1] < 0 else f"pitched beyond {limit_deg:g} degrees"
     text = f"{len(wrong)} of {len(poses)} cameras do not stand upright, {names[worst]} is {what}"
-    transposed = poses.copy()
-    transposed[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
     for cause, undone in (
         ("camera axes look like opencv written as habitat: y and z flipped", opencv_to_habitat(poses)),
         ("the world looks Z-up, as nerfstudio's is: expected Y up", z_up_to_y_up(poses)),
-        ("the rotations look transposed, or world_to_camera was written for camera_to_world", transposed),
+        ("the rotations look transposed, or world_to_camera was written for camera_to_world", transposed(poses)),
     ):
         if is_upright(undone, limit_deg=limit_deg).all():
             return text, cause
@@ -98,7 +97,8 @@ def table_fault(poses: Float, steps: Steps, height_m: float | None) -> str | Non
     raised = steps.position + np.array([0.0, height_m or 0.0, 0.0])
     axes = [0, 1, 2] if height_m is not None else [0, 2]
     away = np.abs(poses[:, :3, 3] - raised)[:, axes].max(axis=1)
-    if (worst := int(away.argmax())) >= 0 and away[worst] > TABLE_M:
+    worst = int(away.argmax())
+    if away[worst] > TABLE_M:
         return (
             f"frame {worst} stands {1000 * away[worst]:.0f} mm from its position in steps.csv "
             f"(camera {'height' if height_m is not None else 'without height'} included, limit {1000 * TABLE_M:g} mm)"
@@ -112,13 +112,7 @@ def table_fault(poses: Float, steps: Steps, height_m: float | None) -> str | Non
 
 
 def impossible_steps(poses: Float, steps: Steps, actions: dict[str, Any]) -> dict[int, str]:
-    """Steps that an agent cannot have made, by the number of the frame that they lead to.
-
-    Args:
-        poses: `(n, 4, 4)` of the captured frames.
-        steps: for the actions.
-        actions: `rollout.json`'s entry of that name: forward_m, turn_deg, tilt_deg.
-    """
+    """Steps between `(n, 4, 4)` poses that an agent cannot have made, by the number of the frame that they lead to."""
     reach, turn, tilt = (float(actions[name]) for name in ("forward_m", "turn_deg", "tilt_deg"))
     moved = np.diff(poses[:, :3, 3], axis=0)
     length = np.linalg.norm(moved[:, [0, 2]], axis=1)
@@ -151,44 +145,21 @@ def cause_of_steps(found: dict[int, str], count: int) -> str | None:
     return None
 
 
-NAME = "format"
-_FOCAL_SHARE = 1e-4
-_POSE_M = 1e-6
-_DEFAULT_PITCH_LIMIT_DEG = 60.0
-
-Fault = tuple[str, str | None]
-"""What was found, and the likely cause where one is known."""
-
-
 def check_format(folder: Path) -> tuple[Rollout | None, Verdict]:
-    """Read a rollout and hold its parts against each other.
-
-    Args:
-        folder: the rollout.
-
-    Returns:
-        The rollout, None when it cannot be read; and the verdict.
-    """
+    """Read a rollout and hold its parts against each other; no rollout where it cannot be read."""
     try:
         rollout = read_rollout(folder)
-        faults = list(_faults(rollout))
+        faults = [fault for part in (_intrinsics, _transforms, _cameras, _walk) for fault in part(rollout)]
     except RolloutError as error:
-        return None, Verdict(NAME, False, str(error), cause=_swapped_size(folder))
+        return None, Verdict("format", False, str(error), cause=_swapped_size(folder))
     views = len(rollout.frames) + len(rollout.heldout)
     figures = {"views": float(views), "faults": float(len(faults))}
     if not faults:
         text = f"{views} views: files, rigid transforms, intrinsics, tables and steps agree (limit: no fault)"
-        return rollout, Verdict(NAME, True, text, figures)
+        return rollout, Verdict("format", True, text, figures)
     text = "; ".join(fault for fault, _ in faults)
     cause = next((cause for _, cause in faults if cause), None)
-    return rollout, Verdict(NAME, False, text, figures, cause)
-
-
-def _faults(rollout: Rollout) -> Iterator[Fault]:
-    yield from _intrinsics(rollout)
-    yield from _transforms(rollout)
-    yield from _cameras(rollout)
-    yield from _walk(rollout)
+    return rollout, Verdict("format", False, text, figures, cause)
 
 
 def _intrinsics(rollout: Rollout) -> Iterator[Fault]:
@@ -197,7 +168,7 @@ def _intrinsics(rollout: Rollout) -> Iterator[Fault]:
         yield f"principal point ({k.cx:g}, {k.cy:g}) outside the picture of {k.width}x{k.height}", _SWAPPED
     elif k.width != k.height and (k.cx, k.cy) == (k.height / 2, k.width / 2):
         yield f"principal point ({k.cx:g}, {k.cy:g}) is the middle of {k.height}x{k.width}", _SWAPPED
-    hfov = rollout.meta.get("camera", {}).get("hfov_deg")
+    hfov = rollout.meta["camera"].get("hfov_deg")
     if not isinstance(hfov, (int, float)) or not 0 < hfov < 180:
         return
     expected = k.width / 2 / np.tan(np.radians(hfov) / 2)
@@ -207,9 +178,6 @@ def _intrinsics(rollout: Rollout) -> Iterator[Fault]:
         percent = 100 * (k.fx / expected - 1)
         cause = _SWAPPED if swapped else f"the focal length is {percent:+.1f} % off, or hfov_deg is wrong"
         yield f"fx is {k.fx:.2f} pixels, expected {expected:.2f} from {k.width} pixels and {hfov:g} degrees", cause
-
-
-_SWAPPED = "width and height look swapped"
 
 
 def _transforms(rollout: Rollout) -> Iterator[Fault]:
@@ -254,7 +222,7 @@ def _cameras(rollout: Rollout) -> Iterator[Fault]:
         return
     names = [f"frame {i}" for i in range(len(rollout.frames))]
     names += [f"held-out view {i}" for i in range(len(rollout.heldout))]
-    limit = float(_actions(rollout).get("pitch_limit_deg", _DEFAULT_PITCH_LIMIT_DEG))
+    limit = float(rollout.meta.get("actions", {}).get("pitch_limit_deg", Walk.pitch_limit_deg))
     fault = upright_fault(np.stack([view.camera_to_world for view in views]), limit, names)
     if fault is not None:
         yield fault
@@ -265,33 +233,23 @@ def _walk(rollout: Rollout) -> Iterator[Fault]:
     if steps is None:
         return
     poses = np.stack([view.camera_to_world for view in rollout.frames])
-    height = rollout.meta.get("camera", {}).get("height_above_floor_m")
-    if contradiction := table_fault(poses, steps, height):
+    if contradiction := table_fault(poses, steps, rollout.meta["camera"].get("height_above_floor_m")):
         yield contradiction, None
-    actions = _actions(rollout)
-    if not {"forward_m", "turn_deg", "tilt_deg"} <= actions.keys():
-        return
-    impossible = impossible_steps(poses, steps, actions)
-    if impossible:
-        first = min(impossible)
-        text = f"{len(impossible)} of {len(poses) - 1} steps are impossible: to frame {first} a {impossible[first]}"
-        yield text, cause_of_steps(impossible, len(poses))
-
-
-def _actions(rollout: Rollout) -> dict[str, Any]:
-    actions = rollout.meta.get("actions")
-    return actions if isinstance(actions, dict) else {}
+    actions = rollout.meta.get("actions", {})
+    if {"forward_m", "turn_deg", "tilt_deg"} <= actions.keys() and (found := impossible_steps(poses, steps, actions)):
+        first = min(found)
+        text = f"{len(found)} of {len(poses) - 1} steps are impossible: to frame {first} a {found[first]}"
+        yield text, cause_of_steps(found, len(poses))
 
 
 def _swapped_size(folder: Path) -> str | None:
     """Say so when the pictures are as wide as `rollout.json` says they are high."""
     try:
-        camera = json.loads((folder / "rollout.json").read_text(encoding="utf-8"))["camera"]
-        with (folder / "images" / f"{frame_name(0)}.png").open("rb") as file:
-            size = struct.unpack(">II", file.read(24)[16:])
-        stated = int(camera["width"]), int(camera["height"])
-    except (OSError, ValueError, TypeError, KeyError, struct.error):
+        camera = read_meta(folder)["camera"]
+        with Image.open(folder / "images" / f"{frame_name(0)}.png") as picture:
+            width, height = picture.size
+    except (RolloutError, OSError, Image.DecompressionBombError):
         return None
-    if stated[0] != stated[1] and size == stated[::-1]:
-        return f"{_SWAPPED}: rollout.json says {stated[0]}x{stated[1]}, the pictures are {size[0]}x{size[1]}"
+    if width != height and (width, height) == (camera["height"], camera["width"]):
+        return f"{_SWAPPED}: rollout.json says {height}x{width}, the pictures are {width}x{height}"
     return None

@@ -163,11 +163,7 @@ class AVPDataParser(DataParser):
 
 
 def nerfstudio_poses(poses: Sequence[NDArray[np.floating]], *, scale: float) -> NDArray[np.float32]:
-    """Poses as nerfstudio keeps them.
-
-    Args:
-        poses: `(4, 4)` camera_to_world each, habitat axes, Y up, metres.
-        scale: multiplies the positions.
+    """Habitat poses `(4, 4)`, Y up, metres, as nerfstudio keeps them.
 
     Returns:
         `(n, 3, 4)` camera_to_world; camera axes OpenGL (the same as habitat's), Z up, metres times `scale`.

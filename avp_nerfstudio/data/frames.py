@@ -30,11 +30,7 @@ _THREADS = 2
 
 
 def read_merged(first: Path, others: Sequence[Path] = ()) -> Rollout:
-    """Read rollouts of one scene that were captured with one camera.
-
-    Args:
-        first: a rollout's folder or its `rollout.json`.
-        others: more of them.
+    """Read rollouts (folders or `rollout.json`) of one scene that were captured with one camera.
 
     Returns:
         The first, with the frames of all, one rollout after another. The held-out views are the first one's: they
@@ -58,7 +54,8 @@ def _check_scene(first: Rollout, other: Rollout) -> None:
     (one, one_lies), (two, two_lies) = _scene(first), _scene(other)
     if one != two:
         raise RolloutError(
-            f"{other.folder}: captured in {two}, but {first.folder} in {one}; only rollouts of one scene can be merged"
+            f"{other.folder}: captured in a scene of sha256 {two}, but {first.folder} in a scene of sha256 {one}; only "
+            "rollouts of one scene can be merged"
         )
     if one_lies != two_lies:
         raise RolloutError(
@@ -68,7 +65,7 @@ def _check_scene(first: Rollout, other: Rollout) -> None:
 
 
 def _scene(rollout: Rollout) -> tuple[str, str]:
-    """Which scene it is, and how its file lies in the rollout's world."""
+    """The digest of its scene, and how the scene's file lies in the rollout's world."""
     scene: Any = rollout.meta.get("scene")
     if not isinstance(scene, dict) or not isinstance(scene.get("sha256"), str):
         raise RolloutError(
@@ -76,7 +73,7 @@ def _scene(rollout: Rollout) -> tuple[str, str]:
             f"merged, found scene {scene!r}"
         )
     origin = scene.get("origin") or [0.0, 0.0, 0.0]
-    return f"a scene of sha256 {scene['sha256']}", f"origin {origin} with {scene.get('up') or 'the usual axis'} up"
+    return scene["sha256"], f"origin {origin} with {scene.get('up') or 'the usual axis'} up"
 
 
 def _check_camera(first: Rollout, other: Rollout) -> None:
@@ -142,11 +139,8 @@ def spread_order(poses: NDArray[np.floating], count: int) -> NDArray[np.intp]:
 def verify_pictures(views: Sequence[View], *, wanted: bool | None) -> None:
     """Decode the pictures and depth images, with every byte held to its checksum; shows progress when it takes long.
 
-    A training decodes them all anyway, but ends in Pillow's traceback then. 11 ms for a view of 640x480 on one core.
-
-    Args:
-        views: whose files.
-        wanted: whether to; None when all of them together have at most `AUTOMATIC_BYTES`.
+    A training decodes them all anyway, but ends in Pillow's traceback then. Unless it is said whether to, it is done
+    when all of them together have at most `AUTOMATIC_BYTES`. 11 ms for a view of 640x480 on one core.
 
     Raises:
         RolloutError: a file is damaged; the text names it.
@@ -178,12 +172,7 @@ class SeenPoints:
 
 
 def seen_points(views: Sequence[View], intrinsics: Intrinsics, *, colours: bool) -> SeenPoints:
-    """Back-project a grid of pixels of views that are evenly spread over the given ones.
-
-    Args:
-        views: at least one.
-        intrinsics: of their pictures.
-        colours: whether to decode the pictures beside the depth.
+    """Back-project a grid of pixels of views that are evenly spread over the given ones, with colours if asked for.
 
     Raises:
         RolloutError: a picture cannot be decoded.
@@ -210,14 +199,9 @@ def subset(points: SeenPoints, count: int) -> SeenPoints:
 
 
 def scene_box(views: Sequence[View], points: SeenPoints, *, margin_m: float) -> NDArray[np.float64]:
-    """The box that holds the cameras and what they saw.
+    """The box that holds the cameras of at least one view and what they saw, with a margin on every side.
 
     Far outliers (a glimpse through a window) do not stretch it.
-
-    Args:
-        views: whose cameras are to be inside; at least one.
-        points: what they saw.
-        margin_m: added on every side.
 
     Returns:
         `(2, 3)` least and greatest corner, metres, Z up.

@@ -108,22 +108,13 @@ class SurfaceGrid(nn.Module):
 
 
 def measured_points(cameras: Cameras, index: int, depth: Tensor) -> Tensor:
-    """What a frame's depth image shows, `(n, 3)` in units of the scene.
+    """What the depth image of the frame `index` shows, `(n, 3)` in units of the scene.
 
-    Args:
-        cameras: of all frames.
-        index: of this frame.
-        depth: `(height, width, 1)` planar depth in units of the scene, 0 = none.
+    `depth` is `(height, width, 1)`, planar, in units of the scene, 0 = none.
     """
-    height, width = depth.shape[:2]
-    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    rows, columns = rows.reshape(-1), columns.reshape(-1)
-    planar = depth[rows, columns]
-    measured = planar[:, 0] > 0
-    rows, columns, planar = rows[measured], columns[measured], planar[measured]
-    pixels = torch.stack([rows, columns], dim=-1) + 0.5
-    rays = cameras.generate_rays(torch.full((len(pixels), 1), index), coords=pixels)
-    return rays.origins + rays.directions * rays.metadata["directions_norm"] * planar
+    pixels = depth[..., 0].nonzero()
+    rays = cameras.generate_rays(torch.full((len(pixels), 1), index), coords=pixels + 0.5)
+    return rays.origins + rays.directions * rays.metadata["directions_norm"] * depth[depth > 0][:, None]
 
 
 @dataclass

@@ -41,7 +41,7 @@ from avp_nerfstudio.data.dataparser import AVPDataParserConfig
 from avp_nerfstudio.method.config import trainer_config
 from avp_nerfstudio.method.hash_encoding import compile_hash_encodings, compile_loops
 from avp_nerfstudio.method.scores import heldout_count, mean_scores, optional_lpips, render_views, to_8_bit
-from avp_nerfstudio.tracking.mlflow import facts_of, open_again
+from avp_nerfstudio.tracking import facts_of, open_again
 
 if TYPE_CHECKING:
     from avp_nerfstudio.reconstruct import Reconstruct
@@ -54,17 +54,7 @@ _PACKAGES = ("avp-suite", "nerfstudio", "torch", "torchvision", "torchmetrics", 
 def process(
     options: "Reconstruct", rollout: Rollout, folder: Path, *, started: float, address: str | None
 ) -> dict[str, Any]:
-    """Train, score, and write everything of the folder.
-
-    Args:
-        options: held to the rollout.
-        rollout: the one they name, as read.
-        folder: where to write; it becomes `options.out`.
-        started: `time.monotonic()` when the work began.
-        address: of the MLflow store, None for none.
-
-    Returns:
-        What `scores.json` holds.
+    """Train, score, and write everything of the folder, which becomes `options.out`; gives what `scores.json` holds.
 
     Raises:
         RolloutError: nerfstudio cannot use the rollout.

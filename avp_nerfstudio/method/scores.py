@@ -53,11 +53,7 @@ def heldout_count(pipeline: Any) -> int:
 
 
 def render_views(pipeline: Any) -> Iterator[HeldoutView]:
-    """Render and score all held-out views by the calls that `ns-eval` makes, one at a time.
-
-    Args:
-        pipeline: nerfstudio's, in evaluation mode, made for testing.
-    """
+    """Render and score all held-out views of a pipeline in evaluation mode by the calls that `ns-eval` makes."""
     names = [Path(path).name for path in pipeline.datamanager.eval_dataset.image_filenames]
     for index, (camera, batch) in enumerate(pipeline.datamanager.fixed_indices_eval_dataloader):
         started = time.monotonic()
@@ -167,11 +163,7 @@ def _error_scale() -> NDArray[np.uint8]:
 
 
 def triptych(view: HeldoutView) -> NDArray[np.uint8]:
-    """Truth, render and error side by side under a strip of words.
-
-    Returns:
-        `(h + strip, 3 w, 3)`.
-    """
+    """Truth, render and error side by side under a strip of words, `(h + strip, 3 w, 3)`."""
     units = {"psnr": " dB", "ssim": "", "lpips": ""}
     scores = [f"{name.upper()} {view.scores[name]:.3g}{units[name]}" for name in units if name in view.scores]
     parts = (

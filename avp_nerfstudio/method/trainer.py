@@ -18,7 +18,7 @@ from avp_habitat.tracking.run import Status
 from avp_habitat.tracking.stores import address_of, open_store
 from avp_nerfstudio.data.refusals import CommandError, discard_outputs
 from avp_nerfstudio.method.checkpoints import loading_fault, newest_checkpoint
-from avp_nerfstudio.tracking.trackers import Trackers
+from avp_nerfstudio.tracking import Trackers
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _STOPPING = b"\nstopping after this iteration; Ctrl-C again to stop at once\n"

@@ -1,6 +1,5 @@
 """Which poses the pictures prove wrong, and the fault that explains it: what, undone, makes their matches fit."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 from statistics import NormalDist
@@ -11,12 +10,14 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from avp_habitat.poses import Intrinsics, wrap_angle
-from avp_nerfstudio.check import hypotheses
+from avp_habitat.poses import Intrinsics
+from avp_nerfstudio.check import mistakes
+from avp_nerfstudio.check.agreement import Cameras
+from avp_nerfstudio.check.mistakes import zoomed
 from avp_nerfstudio.check.pictures.rays import Stacked, pair_medians, ray_errors
-from avp_nerfstudio.check.verdict import full_angles
 
 Float = NDArray[np.floating]
+Mask = NDArray[np.bool_]
 
 # Errors of true matches are 0.1 to 0.2 px in the middle at every size of picture; 0.5 degrees are 0.7 px at 160x120.
 FIT_PX = 0.7
@@ -66,12 +67,7 @@ class FreedFit:
 
 
 def gain_limit(pairs: int, frames: int) -> float:
-    """Greatest gain that chance explains: it grows as the evidence shrinks, and with the number of frames tested.
-
-    Args:
-        pairs: pictures that the frame is matched with, at least one.
-        frames: that are tested.
-    """
+    """Greatest gain that chance explains: it grows as the evidence shrinks, and with the number of frames tested."""
     return USUAL_GAIN + SPREAD_OF_PAIRS * NormalDist().inv_cdf(1 - FALSE_ALARMS / frames) / np.sqrt(pairs)
 
 
@@ -91,14 +87,7 @@ def pair_shares(stacked: Stacked, poses: Float, intrinsics: Intrinsics) -> dict[
 
 
 def freed_fit(stacked: Stacked, poses: Float, intrinsics: Intrinsics, picture: int) -> FreedFit:
-    """Free one pose and let its matches choose another, from the given pose and from that of its richest partner.
-
-    Args:
-        stacked: the matches.
-        poses: `(n, 4, 4)` camera_to_world, habitat axes, of the n pictures.
-        intrinsics: of all pictures.
-        picture: one that has matches.
-    """
+    """Free one pose and let its matches choose another, from the given pose and from that of its richest partner."""
     own = np.flatnonzero((stacked.first == picture) | (stacked.second == picture))
     mine = np.isin(stacked.pair, own)
     part = replace(stacked, pair=stacked.pair[mine], pixels=stacked.pixels[:, mine])
@@ -114,8 +103,9 @@ def freed_fit(stacked: Stacked, poses: Float, intrinsics: Intrinsics, picture: i
     best, best_pose = given, poses[picture]
     for start in (poses[picture], poses[partner]):
         found: Any = least_squares(
-            lambda x, start=start: errors(_moved(start, x)),
+            lambda change, start: errors(_moved(start, change)),
             np.zeros(6),
+            args=(start,),
             loss="cauchy",
             f_scale=_SCALE_PX,
             max_nfev=40,
@@ -127,20 +117,11 @@ def freed_fit(stacked: Stacked, poses: Float, intrinsics: Intrinsics, picture: i
     return FreedFit(len(own), given, best, best_pose)
 
 
-def frames_off(
-    stacked: Stacked, poses: Float, intrinsics: Intrinsics, *, proved: NDArray[np.bool_]
-) -> dict[int, FreedFit]:
-    """Free each pose that may be wrong, and keep those that gain more than chance explains.
+def frames_off(stacked: Stacked, poses: Float, intrinsics: Intrinsics, *, proved: Mask) -> dict[int, FreedFit]:
+    """Free each pose that may be wrong, and keep, by picture, those that gain more than chance explains.
 
-    Args:
-        stacked: the matches.
-        poses: `(n, 4, 4)` camera_to_world, habitat axes, of the n pictures.
-        intrinsics: of all pictures.
-        proved: `(n,)` poses that something else proves right: only a gain of `PROVED_GAIN` in
-            `PROVED_PAIRS` pairs or more speaks against these.
-
-    Returns:
-        By picture.
+    `(n,)` poses are proved right by something else: only a gain of `PROVED_GAIN` in `PROVED_PAIRS` pairs or more
+    speaks against these.
     """
     pairs = np.bincount(stacked.first, minlength=len(poses)) + np.bincount(stacked.second, minlength=len(poses))
     shares = frame_shares(stacked, poses, intrinsics)
@@ -158,12 +139,6 @@ def frames_off(
     return found
 
 
-def shift_and_turn(fit: FreedFit, pose: Float) -> tuple[float, float]:
-    """Metres and degrees from the pose that fits to the given one."""
-    turned = Rotation.from_matrix(pose[:3, :3] @ fit.pose[:3, :3].T).magnitude()
-    return float(np.linalg.norm(pose[:3, 3] - fit.pose[:3, 3])), float(np.degrees(turned))
-
-
 def _moved(pose: Float, change: Float) -> Float:
     moved = pose.copy()
     moved[:3, 3] += change[:3]
@@ -176,15 +151,10 @@ def best_focal_factor(stacked: Stacked, poses: Float, intrinsics: Intrinsics) ->
 
     A walk without turns shows the same epipolar geometry at every focal length: 1.0 too where no factor is better than
     the focal length as given by `FOCAL_GAIN_PX`, and by `FOCAL_GAIN_NOISES` times what it varies by between pairs.
-
-    Args:
-        stacked: the matches.
-        poses: `(n, 4, 4)` camera_to_world, habitat axes.
-        intrinsics: as given.
     """
 
     def medians(factor: float) -> Float:
-        errors = ray_errors(stacked, poses, _zoomed(intrinsics, factor)) / factor
+        errors = ray_errors(stacked, poses, zoomed(intrinsics, factor)) / factor
         return np.minimum(pair_medians(stacked, errors), _CLIP_PX)
 
     def cost(factor: float) -> float:
@@ -203,95 +173,49 @@ def best_focal_factor(stacked: Stacked, poses: Float, intrinsics: Intrinsics) ->
 
 def likely_cause(
     stacked: Stacked,
-    poses: Float,
-    intrinsics: Intrinsics,
+    given: Cameras,
     *,
     focal_factor: float,
     off: dict[int, FreedFit],
     frames: NDArray[np.int64],
-    proved: NDArray[np.bool_],
+    proved: Mask,
 ) -> str | None:
-    """The fault that explains why the pictures contradict the poses, in words.
+    """The fault that explains why the pictures contradict the poses, in words; None when no known one does.
 
     Args:
         stacked: the matches.
-        poses: `(n, 4, 4)` camera_to_world, habitat axes.
-        intrinsics: as given.
+        given: the cameras of the n pictures.
         focal_factor: of `best_focal_factor`.
         off: the pictures whose poses do not fit, of `frames_off`.
         frames: `(n,)` frame numbers, for the text.
         proved: `(n,)` pictures whose poses something else proves right.
-
-    Returns:
-        None when no known fault explains it.
     """
-    few = 0 < len(off) <= max(2, _FEW_FRAMES * len(poses))
-    if few and abs(focal_factor - 1) < FOCAL_TOLERANCE:
-        return _cause_in_frames(stacked, poses, intrinsics, off=off, frames=frames, proved=proved)
-    return _cause_in_all(stacked, poses, intrinsics, focal_factor=focal_factor)
-
-
-def _cause_in_all(stacked: Stacked, poses: Float, intrinsics: Intrinsics, *, focal_factor: float) -> str | None:
-    """The fault whose undoing makes most matches fit."""
-    best, most = None, max(_HEALED, float(np.nanmean(frame_shares(stacked, poses, intrinsics))) + _BETTER)
-    for text, undone, camera in _undone(poses, intrinsics, focal_factor):
-        share = float(np.nanmean(frame_shares(stacked, undone, camera)))
+    wrong_focal = abs(focal_factor - 1) >= FOCAL_TOLERANCE
+    if 0 < len(off) <= max(2, _FEW_FRAMES * len(given.poses)) and not wrong_focal:
+        return _cause_in_frames(stacked, given, off, frames, proved)
+    best, most = None, max(_HEALED, _mean_share(stacked, given) + _BETTER)
+    known = [mistakes.focal_factor(given, 1 / focal_factor, evidence="pictures")] if wrong_focal else []
+    for mistake in (*known, *mistakes.usual(given)):
+        share = _mean_share(stacked, mistake.cameras)
         if share > most:
-            best, most = text, share
+            best, most = mistake.cause, share
     return best
 
 
-def _zoomed(intrinsics: Intrinsics, factor: float) -> Intrinsics:
-    return replace(intrinsics, fx=intrinsics.fx * factor, fy=intrinsics.fy * factor)
-
-
-def _undone(poses: Float, intrinsics: Intrinsics, focal_factor: float) -> Iterator[tuple[str, Float, Intrinsics]]:
-    """Each fault of a whole rollout: its words, and the poses and intrinsics without it."""
-    given = hypotheses.Cameras(poses, intrinsics, len(poses), np.ones(len(poses), bool))
-    if abs(focal_factor - 1) >= FOCAL_TOLERANCE:
-        yield _focal_words(intrinsics, focal_factor), poses, _zoomed(intrinsics, focal_factor)
-    degrees = hypotheses.degrees_taken_for_radians(given, _whole_degrees(poses), "all")
-    for found in (
-        *hypotheses.conventions(given, "all"),
-        *hypotheses.time_shifts(given),
-        *hypotheses.radians_taken_for_degrees(given, "all"),
-        degrees,
-        *hypotheses.swapped_intrinsics(given),
-    ):
-        yield found.cause, found.cameras.poses, found.cameras.intrinsics
-
-
-def _focal_words(intrinsics: Intrinsics, factor: float) -> str:
-    longer = 100 * (1 / factor - 1)
-    return (
-        f"the focal length looks {abs(longer):.1f} % too {'long' if longer > 0 else 'short'}: "
-        f"expected {intrinsics.fx * factor:.1f} px, found {intrinsics.fx:.1f} px"
-    )
-
-
-def _whole_degrees(poses: Float) -> Float:
-    """`(n,)` the pitch in radians that is the whole number of degrees which, read as radians, gives the pitch now."""
-    degrees = np.arange(-90, 91)
-    nearest = np.abs(wrap_angle(full_angles(poses)[1][:, None] - degrees)).argmin(axis=1)
-    return np.radians(degrees[nearest])
+def _mean_share(stacked: Stacked, cameras: Cameras) -> float:
+    return float(np.nanmean(frame_shares(stacked, cameras.poses, cameras.intrinsics)))
 
 
 def _cause_in_frames(
-    stacked: Stacked,
-    poses: Float,
-    intrinsics: Intrinsics,
-    *,
-    off: dict[int, FreedFit],
-    frames: NDArray[np.int64],
-    proved: NDArray[np.bool_],
+    stacked: Stacked, given: Cameras, off: dict[int, FreedFit], frames: NDArray[np.int64], proved: Mask
 ) -> str:
     pictures = sorted(off)
     what, other = ("pictures", "poses") if proved[pictures].all() else ("poses", "pictures")
     known = ": the depth proves the poses right" if what == "pictures" else ""
     for first, second in combinations(pictures, 2):
-        exchanged = poses.copy()
-        exchanged[[first, second]] = poses[[second, first]]
-        shares = frame_shares(stacked, exchanged, intrinsics)
+        exchanged = given.poses.copy()
+        exchanged[[first, second]] = given.poses[[second, first]]
+        shares = frame_shares(stacked, exchanged, given.intrinsics)
         if all(shares[picture] - off[picture].given > off[picture].gain / 2 for picture in (first, second)):
             return f"the {what} of frames {frames[first]} and {frames[second]} look exchanged{known}"
     names = ", ".join(str(frame) for frame in frames[pictures])
@@ -299,8 +223,7 @@ def _cause_in_frames(
         return f"the {what} of frames {names} do not fit their {other}, those of the others do{known}"
     if known:
         return f"the picture of frame {names} does not fit its pose{known}"
-    shift_m, turn_deg = shift_and_turn(off[pictures[0]], poses[pictures[0]])
-    return (
-        f"the pose of frame {names} looks {100 * shift_m:.1f} cm and {turn_deg:.1f} degrees off, "
-        "those of the others fit"
-    )
+    pose, fit = given.poses[pictures[0]], off[pictures[0]].pose
+    shift_cm = 100 * np.linalg.norm(pose[:3, 3] - fit[:3, 3])
+    turn_deg = np.degrees(Rotation.from_matrix(pose[:3, :3] @ fit[:3, :3].T).magnitude())
+    return f"the pose of frame {names} looks {shift_cm:.1f} cm and {turn_deg:.1f} degrees off, those of the others fit"

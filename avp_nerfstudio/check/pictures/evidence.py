@@ -1,13 +1,14 @@
 """Checking a rollout's poses against what its pictures alone say."""
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.poses import Intrinsics
 from avp_habitat.rollout.format import Rollout
+from avp_nerfstudio.check import Verdict
+from avp_nerfstudio.check.agreement import Cameras
 from avp_nerfstudio.check.colmap import triangulate
 from avp_nerfstudio.check.pictures.causes import (
     FIT_PX,
@@ -28,7 +29,6 @@ from avp_nerfstudio.check.pictures.rays import (
     relative_errors,
     stack_matches,
 )
-from avp_nerfstudio.check.verdict import Verdict
 
 Float = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -56,26 +56,18 @@ def check_pictures(
     *,
     matches: Matches | None = None,
     proved: Mask | None = None,
-    workdir: Path | None = None,
     progress: bool = True,
 ) -> list[Verdict]:
-    """Two verdicts on a rollout's poses and intrinsics: "reprojection" and "relative poses".
-
-    Args:
-        rollout: a checked rollout; its held-out views are not looked at.
-        matches: of the rollout's pictures, where they are known already.
-        proved: per frame, whether the depth proves its pose right; none when omitted.
-        workdir: where temporary folders are made; the system's place when omitted.
-        progress: show bars where the output is a terminal.
+    """The verdicts of `judge` on a rollout, whose held-out views are not looked at; `proved` is per frame.
 
     Raises:
         RolloutError: a picture cannot be read.
     """
-    matches = matches or match_pictures(rollout, workdir=workdir, progress=progress)
+    matches = matches or match_pictures(rollout, progress=progress)
     poses = np.array([rollout.frames[index].camera_to_world for index in matches.frames]).reshape(-1, 4, 4)
     of_pictures = None if proved is None else proved[matches.frames]
     verdicts = judge(matches, poses, rollout.intrinsics, proved=of_pictures)
-    return [_with_points(verdicts[0], matches, poses, rollout.intrinsics, workdir), *verdicts[1:]]
+    return [_with_points(verdicts[0], matches, poses, rollout.intrinsics), *verdicts[1:]]
 
 
 def judge(
@@ -108,33 +100,37 @@ def judge(
     fit = frame_shares(stacked, poses, intrinsics)
     misfit = 1 - float(np.nanmedian(fit))
     off = frames_off(stacked, poses, intrinsics, proved=proved) if misfit <= MISFIT_LIMIT else {}
-    cause = likely_cause(stacked, poses, intrinsics, focal_factor=factor, off=off, frames=matches.frames, proved=proved)
-    error_px = float(np.median(ray_errors(stacked, poses, intrinsics)))
+    given = Cameras(poses, intrinsics, len(poses), np.ones(len(poses), bool))
+    cause = likely_cause(stacked, given, focal_factor=factor, off=off, frames=matches.frames, proved=proved)
     estimated = estimated or estimate_relative_poses(matches, intrinsics)
     shares = pair_shares(stacked, poses, intrinsics)
     pairs = zip(estimated.first.tolist(), estimated.second.tolist(), strict=True)
     fitting = np.array([shares[pair] >= 1 - MISFIT_LIMIT for pair in pairs], bool)
+    figures = {
+        "misfit_percent": 100 * misfit,
+        "judged_frames": float(known),
+        "frames": float(len(poses)),
+        "pairs": float(len(matches.pairs)),
+    }
     right = fit[proved & np.isfinite(fit)]
     false = misfit > MISFIT_LIMIT and len(right) >= MIN_PROVED and 1 - np.median(right) > MISFIT_LIMIT
     if false and len(fitting) >= MIN_PAIRS and fitting.mean() >= FITTING_SHARE:
-        reprojection = _false_matches(matches, known, misfit=misfit, right=len(right), fitting=fitting)
+        reprojection = _false_matches(figures, right=len(right), fitting=fitting)
     else:
-        reprojection = _judge_reprojection(
-            matches, known, misfit=misfit, error_px=error_px, off=off, factor=factor, cause=cause
-        )
-    return [
-        reprojection,
-        _judge_relative(matches, estimated, poses, intrinsics, fitting=fitting, cause=cause),
-    ]
+        figures |= {
+            "ray_error_median_px": float(np.median(ray_errors(stacked, poses, intrinsics))),
+            "frames_off": float(len(off)),
+            "best_focal_factor": factor,
+        }
+        reprojection = _judge_reprojection(matches, figures, off, cause)
+    return [reprojection, _judge_relative(matches, estimated, given, fitting, cause)]
 
 
-def _with_points(
-    verdict: Verdict, matches: Matches, poses: Float, intrinsics: Intrinsics, workdir: Path | None
-) -> Verdict:
+def _with_points(verdict: Verdict, matches: Matches, poses: Float, intrinsics: Intrinsics) -> Verdict:
     """The verdict with what COLMAP triangulates: no part of it, because where nothing moves only false matches do."""
     if "misfit_percent" not in verdict.figures:
         return verdict
-    model = triangulate(matches, poses, intrinsics, workdir=workdir)
+    model = triangulate(matches, poses, intrinsics)
     points = model.num_points3D()
     figures = {
         "points": float(points),
@@ -148,27 +144,13 @@ def _with_points(
     return replace(verdict, text=text, figures=verdict.figures | figures)
 
 
-@dataclass(frozen=True)
-class _Limit:
-    """One figure held to its limit."""
-
-    text: str
-    """What was measured, with its value."""
-    value: float
-    """As measured."""
-    most: float
-    """What it may be."""
-
-    @property
-    def kept(self) -> bool:
-        return self.value <= self.most
+_Limit = tuple[str, float, float]
+"""What was measured, with its value; the value; and what it may be at most."""
 
 
-def _verdict(
-    name: str, limits: list[_Limit], figures: dict[str, float], cause: str | None, *, note: str = ""
-) -> Verdict:
-    broken = [limit for limit in limits if not limit.kept]
-    text = "; ".join(f"{limit.text} (limit {limit.most:.3g})" for limit in broken or limits)
+def _verdict(name: str, limits: list[_Limit], figures: dict[str, float], cause: str | None, *, note: str) -> Verdict:
+    broken = [(text, value, most) for text, value, most in limits if value > most]
+    text = "; ".join(f"{text} (limit {most:.3g})" for text, _, most in broken or limits)
     return Verdict(name, not broken, text + note, figures, cause if broken else None)
 
 
@@ -186,43 +168,21 @@ def _unjudged(name: str, matches: Matches, known: int) -> Verdict:
     return Verdict(name, True, text, figures)
 
 
-def _false_matches(matches: Matches, known: int, *, misfit: float, right: int, fitting: Mask) -> Verdict:
+def _false_matches(figures: dict[str, float], *, right: int, fitting: Mask) -> Verdict:
     """Patterns that repeat match falsely in whole pairs: where poses are right for sure, that is no fault of them."""
-    figures = {
-        "misfit_percent": 100 * misfit,
-        "judged_frames": 0.0,
-        "frames": float(len(matches.names)),
-        "pairs": float(len(matches.pairs)),
-    }
     text = (
-        f"could not be judged: {100 * misfit:.0f} % of the matches of {known} frames are off by more than {FIT_PX} px, "
-        f"but also at {right} poses that the depth proves right, and {int(fitting.sum())} of {len(fitting)} relative "
-        "poses fit: the matches are false, as of patterns that repeat"
+        f"could not be judged: {figures['misfit_percent']:.0f} % of the matches of {figures['judged_frames']:.0f} "
+        f"frames are off by more than {FIT_PX} px, but also at {right} poses that the depth proves right, and "
+        f"{int(fitting.sum())} of {len(fitting)} relative poses fit: the matches are false, as of patterns that repeat"
     )
-    return Verdict("reprojection", True, text, figures)
+    return Verdict("reprojection", True, text, figures | {"judged_frames": 0.0})
 
 
 def _judge_reprojection(
-    matches: Matches,
-    known: int,
-    *,
-    misfit: float,
-    error_px: float,
-    off: dict[int, FreedFit],
-    factor: float,
-    cause: str | None,
+    matches: Matches, figures: dict[str, float], off: dict[int, FreedFit], cause: str | None
 ) -> Verdict:
-    frames = len(matches.names)
-    figures = {
-        "misfit_percent": 100 * misfit,
-        "ray_error_median_px": error_px,
-        "frames_off": float(len(off)),
-        "best_focal_factor": factor,
-        "judged_frames": float(known),
-        "frames": float(frames),
-        "pairs": float(len(matches.pairs)),
-    }
-    named = f"{len(off)} of {known} frames would fit much better elsewhere"
+    misfit, wrong_focal = figures["misfit_percent"], 100 * abs(figures["best_focal_factor"] - 1)
+    named = f"{len(off)} of {figures['judged_frames']:.0f} frames would fit much better elsewhere"
     if off:
         worst = max(off, key=lambda picture: off[picture].gain)
         figures |= {"worst_frame": float(matches.frames[worst]), "worst_frame_gain_percent": 100 * off[worst].gain}
@@ -230,37 +190,30 @@ def _judge_reprojection(
             f", worst frame {matches.frames[worst]}: {100 * off[worst].given:.0f} % of its matches in "
             f"{off[worst].pairs} pairs fit, {100 * off[worst].freed:.0f} % were it freed"
         )
-    limits = [
-        _Limit(f"{100 * misfit:.0f} % of the matches off by more than {FIT_PX} px", 100 * misfit, 100 * MISFIT_LIMIT),
-        _Limit(named, len(off), 0),
-        _Limit(f"focal length {100 * abs(factor - 1):.2f} % off", 100 * abs(factor - 1), 100 * FOCAL_TOLERANCE),
+    limits: list[_Limit] = [
+        (f"{misfit:.0f} % of the matches off by more than {FIT_PX} px", misfit, 100 * MISFIT_LIMIT),
+        (named, len(off), 0),
+        (f"focal length {wrong_focal:.2f} % off", wrong_focal, 100 * FOCAL_TOLERANCE),
     ]
-    return _verdict("reprojection", limits, figures, cause, note=_note(frames - known, frames))
-
-
-def _note(left_out: int, frames: int) -> str:
-    return f"; {left_out} of {frames} frames show too little to be judged" if left_out else ""
+    frames = len(matches.names)
+    left_out = frames - int(figures["judged_frames"])
+    note = f"; {left_out} of {frames} frames show too little to be judged" if left_out else ""
+    return _verdict("reprojection", limits, figures, cause, note=note)
 
 
 def _judge_relative(
-    matches: Matches,
-    estimated: RelativePoses,
-    poses: Float,
-    intrinsics: Intrinsics,
-    *,
-    fitting: Mask,
-    cause: str | None,
+    matches: Matches, estimated: RelativePoses, given: Cameras, fitting: Mask, cause: str | None
 ) -> Verdict:
     # Features are located to a part of a pixel, which is a greater angle in small pictures.
-    coarseness = max(1.0, FULL_FOCAL_PX / np.sqrt(intrinsics.fx * intrinsics.fy))
-    rotation_deg, direction_deg = relative_errors(estimated, poses)
+    coarseness = max(1.0, FULL_FOCAL_PX / np.sqrt(given.intrinsics.fx * given.intrinsics.fy))
+    rotation_deg, direction_deg = relative_errors(estimated, given.poses)
     moved = np.isfinite(direction_deg)
     if len(rotation_deg) < MIN_PAIRS:
         return _unjudged("relative poses", matches, len(set(estimated.first) | set(estimated.second)))
     # Where the matches fit the poses too, another estimate says nothing against these: one wall, or few features in a
     # corner, look the same from other places.
     counted_deg = np.where(fitting, 0.0, rotation_deg)
-    frames_deg = frame_medians(estimated, counted_deg, len(poses))
+    frames_deg = frame_medians(estimated, counted_deg, len(given.poses))
     worst = int(np.nanargmax(frames_deg))
     figures = {
         "worst_frame_rotation_deg": float(frames_deg[worst]),
@@ -271,22 +224,22 @@ def _judge_relative(
         "pairs_with_direction": float(moved.sum()),
         "fitting_pairs": float(fitting.sum()),
     }
-    limits = [
-        _Limit(
+    limits: list[_Limit] = [
+        (
             f"rotation of {len(rotation_deg)} pairs {figures['rotation_median_deg']:.3f} deg off (median)",
             float(np.median(counted_deg)),
             coarseness * ROTATION_LIMIT_DEG,
         ),
-        _Limit(
+        (
             f"worst frame {matches.frames[worst]} turned by {frames_deg[worst]:.2f} deg",
-            figures["worst_frame_rotation_deg"],
+            float(frames_deg[worst]),
             coarseness * FRAME_ROTATION_LIMIT_DEG,
         ),
     ]
     if moved.sum() >= MIN_PAIRS:
         figures["direction_median_deg"] = float(np.median(direction_deg[moved]))
         limits.append(
-            _Limit(
+            (
                 f"direction of {moved.sum()} pairs {figures['direction_median_deg']:.2f} deg off (median)",
                 float(np.median(np.where(fitting, 0.0, direction_deg)[moved])),
                 coarseness * DIRECTION_LIMIT_DEG,

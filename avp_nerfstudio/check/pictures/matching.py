@@ -1,10 +1,11 @@
 """Features of a rollout's pictures and their matches, found without looking at its poses or its focal length."""
 
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,11 @@ class Matches:
     pairs: list[PairMatches]
     """Pairs with at least `MIN_MATCHES` matches."""
 
+    def pixels(self, pair: PairMatches) -> NDArray[np.float64]:
+        """`(2, m, 2)` where the matches of a pair lie in its first and in its second picture."""
+        first, second = pair.features.T
+        return np.array([self.features[pair.first][first], self.features[pair.second][second]])
+
 
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
@@ -75,13 +81,21 @@ def quiet_colmap() -> Iterator[None]:
         pycolmap.logging.minloglevel = before
 
 
-def match_pictures(rollout: Rollout, *, workdir: Path | None = None, progress: bool = True) -> Matches:
+def ransac_options(max_error_px: float, *, most: int) -> pycolmap.RANSACOptions:
+    """Options that find the same every time, in at most so many trials."""
+    options = pycolmap.RANSACOptions()
+    options.max_error = max_error_px
+    options.min_num_trials, options.max_num_trials = 100, most
+    options.random_seed = 0
+    return options
+
+
+def match_pictures(rollout: Rollout, *, progress: bool = True) -> Matches:
     """SIFT on the frames of a rollout, matched pair by pair and verified by uncalibrated epipolar geometry.
 
     Args:
         rollout: of at most `MAX_FRAMES` frames, or else runs of its frames are taken.
-        workdir: where COLMAP's database lies meanwhile; a temporary folder, removed at the end, when omitted.
-        progress: show bars where the output is a terminal.
+        progress: show bars.
 
     Raises:
         RolloutError: a picture is damaged or cannot be read.
@@ -93,12 +107,13 @@ def match_pictures(rollout: Rollout, *, workdir: Path | None = None, progress: b
         check_png_contents(path)
     folder = paths[0].parent if paths else rollout.folder
     names = [path.name for path in paths]
-    with quiet_colmap(), tempfile.TemporaryDirectory(dir=workdir, prefix="pictures-") as scratch:
+    with quiet_colmap(), tempfile.TemporaryDirectory(prefix="pictures-") as scratch:
         database = Path(scratch) / "database.db"
         features = _extract(database, folder, names, progress=progress)
-        pairs = _candidates(len(names))
-        raw = _match(database, names, pairs, progress=progress)
-    return Matches(folder, names, frames, features, _verify(features, _best(raw), progress=progress))
+        raw = _match(database, names, _candidates(len(names)), progress=progress)
+    best = sorted(best_pairs(raw, BEST_PAIRS_OF_A_FRAME, least=MIN_MATCHES), key=lambda pair: (pair.first, pair.second))
+    matches = Matches(folder, names, frames, features, best)
+    return replace(matches, pairs=_verify(matches, progress=progress))
 
 
 def _choose_frames(count: int) -> NDArray[np.int64]:
@@ -138,27 +153,18 @@ def _extract(database: Path, folder: Path, names: list[str], *, progress: bool) 
                 device=pycolmap.Device.cpu,
             )
             bar.update(len(batch))
-    return _read_features(database, folder, names)
-
-
-def _read_features(database: Path, folder: Path, names: list[str]) -> list[NDArray[np.float64]]:
-    opened = pycolmap.Database.open(database)
-    try:
-        features = []
+    features = []
+    with pycolmap.Database.open(database) as opened:
         for name in names:
             image = opened.read_image_with_name(name)
             if image is None:
                 raise RolloutError(f"{folder / name}: expected an 8-bit RGB PNG, COLMAP could not read its pixels")
             features.append(opened.read_keypoints(image.image_id)[:, :2].astype(np.float64))
-        return features
-    finally:
-        opened.close()
+    return features
 
 
-def _match(
-    database: Path, names: list[str], pairs: list[tuple[int, int]], *, progress: bool
-) -> list[tuple[int, int, NDArray[np.uint32]]]:
-    """Nearest descriptors of every pair, `(first, second, (m, 2) features)`."""
+def _match(database: Path, names: list[str], pairs: list[tuple[int, int]], *, progress: bool) -> list[PairMatches]:
+    """Nearest descriptors of every pair, not verified."""
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = _THREADS
     options.use_gpu = False
@@ -173,57 +179,39 @@ def _match(
                 database, matching_options=options, pairing_options=pairing, device=pycolmap.Device.cpu
             )
             bar.update(len(batch))
-    return _read_matches(database, names)
-
-
-def _read_matches(database: Path, names: list[str]) -> list[tuple[int, int, NDArray[np.uint32]]]:
     place = {name: index for index, name in enumerate(names)}
-    opened = pycolmap.Database.open(database)
-    try:
+    found = []
+    with pycolmap.Database.open(database) as opened:
         where = {image.image_id: place[image.name] for image in opened.read_all_images()}
-        found = []
         for pair_id, features in zip(*opened.read_all_matches(), strict=True):
             first, second = (where[image] for image in pycolmap.pair_id_to_image_pair(pair_id))
-            found.append((first, second, features) if first < second else (second, first, features[:, ::-1]))
-        return found
-    finally:
-        opened.close()
+            ordered = (first, second, features) if first < second else (second, first, features[:, ::-1])
+            found.append(PairMatches(*ordered))
+    return found
 
 
-def _best(raw: list[tuple[int, int, NDArray[np.uint32]]]) -> list[tuple[int, int, NDArray[np.uint32]]]:
-    """Pairs that are among the best of one of their frames."""
-    taken: dict[int, int] = {}
+def best_pairs(pairs: list[PairMatches], of_a_frame: int, *, least: int) -> list[PairMatches]:
+    """Pairs with enough matches that are among the best of one of their frames, the richest first."""
+    taken: Counter[int] = Counter()
     best = []
-    for pair in sorted(raw, key=lambda pair: -len(pair[2])):
-        first, second, features = pair
-        used = min(taken.get(first, 0), taken.get(second, 0))
-        if len(features) >= MIN_MATCHES and used < BEST_PAIRS_OF_A_FRAME:
+    for pair in sorted(pairs, key=lambda pair: -len(pair.features)):
+        if len(pair.features) >= least and min(taken[pair.first], taken[pair.second]) < of_a_frame:
             best.append(pair)
-            taken[first] = taken.get(first, 0) + 1
-            taken[second] = taken.get(second, 0) + 1
-    return sorted(best, key=lambda pair: pair[:2])
+            taken.update((pair.first, pair.second))
+    return best
 
 
-def _verify(
-    features: list[NDArray[np.float64]], raw: list[tuple[int, int, NDArray[np.uint32]]], *, progress: bool
-) -> list[PairMatches]:
+def _verify(unverified: Matches, *, progress: bool) -> list[PairMatches]:
     """Matches that fit one fundamental matrix, of pairs that keep enough of them."""
-    options = pycolmap.RANSACOptions()
-    options.max_error = VERIFY_MAX_ERROR_PX
-    options.min_num_trials, options.max_num_trials = 100, 2000
-    options.random_seed = 0
+    options = ransac_options(VERIFY_MAX_ERROR_PX, most=2000)
 
-    def verified(pair: tuple[int, int, NDArray[np.uint32]]) -> PairMatches | None:
-        first, second, rows = pair
-        found = pycolmap.estimate_fundamental_matrix(features[first][rows[:, 0]], features[second][rows[:, 1]], options)
+    def verified(pair: PairMatches) -> PairMatches | None:
+        found = pycolmap.estimate_fundamental_matrix(*unverified.pixels(pair), options)
         if found is None or found["num_inliers"] < MIN_MATCHES:
             return None
-        return PairMatches(first, second, rows[np.asarray(found["inlier_mask"], dtype=bool)])
+        return replace(pair, features=pair.features[np.asarray(found["inlier_mask"], dtype=bool)])
 
-    pairs = []
-    with ThreadPoolExecutor(_THREADS) as pool, _bar(len(raw), "verifying", "pair", progress=progress) as bar:
-        for pair in pool.map(verified, raw):
-            bar.update()
-            if pair is not None:
-                pairs.append(pair)
-    return pairs
+    with ThreadPoolExecutor(_THREADS) as pool:
+        done = pool.map(verified, unverified.pairs)
+        bar = command.progress(done, total=len(unverified.pairs), desc="verifying", unit="pair", disable=not progress)
+        return [pair for pair in bar if pair is not None]

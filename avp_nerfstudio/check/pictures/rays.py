@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from avp_habitat.poses import Intrinsics, habitat_to_opencv
 from avp_nerfstudio.check.colmap import colmap_camera
-from avp_nerfstudio.check.pictures.matching import Matches, quiet_colmap
+from avp_nerfstudio.check.pictures.matching import Matches, best_pairs, quiet_colmap, ransac_options
 
 Float = NDArray[np.floating]
 
@@ -43,22 +43,15 @@ class Stacked:
 
 def stack_matches(matches: Matches, *, limit: int = 60) -> Stacked:
     """At most `limit` matches of each pair, evenly chosen, side by side."""
-    kept = [pair.features[:: -(-len(pair.features) // limit)] for pair in matches.pairs]
-    counts = np.array([len(rows) for rows in kept], dtype=int)
-    sides = [
-        [matches.features[picture][rows[:, side]] for picture, rows in zip(pictures, kept, strict=True)]
-        for side, pictures in enumerate(
-            ([pair.first for pair in matches.pairs], [pair.second for pair in matches.pairs])
-        )
-    ]
-    pixels = np.array([np.concatenate([np.empty((0, 2)), *side]) for side in sides])
+    pixels = [matches.pixels(pair)[:, :: -(-len(pair.features) // limit)] for pair in matches.pairs]
+    counts = np.array([part.shape[1] for part in pixels], dtype=int)
     return Stacked(
-        np.repeat(np.arange(len(kept)), counts),
+        np.repeat(np.arange(len(pixels)), counts),
         np.array([pair.first for pair in matches.pairs], dtype=int),
         np.array([pair.second for pair in matches.pairs], dtype=int),
         np.concatenate([[0], np.cumsum(counts)]),
         np.array([len(pair.features) for pair in matches.pairs], dtype=int),
-        pixels,
+        np.concatenate([np.empty((2, 0, 2)), *pixels], axis=1),
     )
 
 
@@ -71,19 +64,11 @@ def viewing_rays(pixels: Float, intrinsics: Intrinsics) -> Float:
 
 
 def ray_errors(stacked: Stacked, poses: Float, intrinsics: Intrinsics) -> Float:
-    """How far each match lies from where the poses allow it, in pixels at the image centre.
+    """How far each match lies from where `(n, 4, 4)` habitat poses allow it, `(m,)` in pixels at the image centre.
 
     A feature of the first picture lies somewhere on its viewing ray, from `NEAREST_M` to infinity; the second camera
     sees that as an arc of a great circle. The error is the angle from the match's ray to this arc, times the focal
     length. Unlike an epipolar distance, it is defined for cameras that only turned and for any pair of axes.
-
-    Args:
-        stacked: the matches.
-        poses: `(n, 4, 4)` camera_to_world, habitat axes, of the n pictures.
-        intrinsics: of all pictures.
-
-    Returns:
-        `(m,)` pixels.
     """
     camera = habitat_to_opencv(poses)
     first, second = stacked.first[stacked.pair], stacked.second[stacked.pair]
@@ -132,16 +117,12 @@ class RelativePoses:
 
 
 def estimate_relative_poses(matches: Matches, intrinsics: Intrinsics) -> RelativePoses:
-    """Essential matrices (LO-RANSAC, then refined) of pairs with parallax, rotations alone of the others.
-
-    Args:
-        matches: verified ones.
-        intrinsics: of all pictures.
-    """
+    """Essential matrices (LO-RANSAC, then refined) of pairs with parallax, rotations alone of the others."""
     rows = []
     camera = colmap_camera(intrinsics)
     with quiet_colmap():
-        for first, second, pixels in _chosen_pairs(matches):
+        for pair in best_pairs(matches.pairs, PAIRS_OF_A_FRAME, least=MIN_RELATIVE_MATCHES):
+            pixels = matches.pixels(pair)
             rotation, parallax_px = _turn(viewing_rays(pixels, intrinsics), intrinsics)
             direction = np.full(3, np.nan)
             if parallax_px >= MIN_PARALLAX_PX:
@@ -149,7 +130,7 @@ def estimate_relative_poses(matches: Matches, intrinsics: Intrinsics) -> Relativ
                 if found is None:
                     continue
                 rotation, direction = found
-            rows.append((first, second, rotation, direction))
+            rows.append((pair.first, pair.second, rotation, direction))
     return RelativePoses(
         np.array([row[0] for row in rows], dtype=int),
         np.array([row[1] for row in rows], dtype=int),
@@ -159,11 +140,7 @@ def estimate_relative_poses(matches: Matches, intrinsics: Intrinsics) -> Relativ
 
 
 def relative_errors(estimated: RelativePoses, poses: Float) -> tuple[Float, Float]:
-    """Difference of given poses from the estimated relative ones.
-
-    Args:
-        estimated: from the pictures.
-        poses: `(n, 4, 4)` camera_to_world, habitat axes, of the pictures.
+    """Difference of `(n, 4, 4)` poses with habitat axes from the estimated relative ones.
 
     Returns:
         `(k,)` degrees between the rotations, and `(k,)` degrees between the directions of translation: NaN where
@@ -186,19 +163,6 @@ def frame_medians(estimated: RelativePoses, errors: Float, count: int) -> Float:
     return medians
 
 
-def _chosen_pairs(matches: Matches) -> list[tuple[int, int, Float]]:
-    """The richest pairs of each frame: first, second, `(2, m, 2)` pixels."""
-    taken = np.zeros(len(matches.names), dtype=int)
-    chosen = []
-    for pair in sorted(matches.pairs, key=lambda pair: -len(pair.features)):
-        rich = len(pair.features) >= MIN_RELATIVE_MATCHES
-        if rich and min(taken[pair.first], taken[pair.second]) < PAIRS_OF_A_FRAME:
-            taken[[pair.first, pair.second]] += 1
-            pixels = [matches.features[p][pair.features[:, k]] for k, p in enumerate((pair.first, pair.second))]
-            chosen.append((pair.first, pair.second, np.array(pixels)))
-    return chosen
-
-
 def _turn(rays: Float, intrinsics: Intrinsics) -> tuple[Float, float]:
     """Rotation that best carries `(2, m, 3)` rays of the first camera to the second's, and the parallax it leaves.
 
@@ -215,10 +179,7 @@ def _turn(rays: Float, intrinsics: Intrinsics) -> tuple[Float, float]:
 
 
 def _essential(camera: pycolmap.Camera, pixels: Float) -> tuple[Float, Float] | None:
-    options = pycolmap.RANSACOptions()
-    options.max_error = MAX_ERROR_PX
-    options.min_num_trials, options.max_num_trials = 100, 1000
-    options.random_seed = 0
+    options = ransac_options(MAX_ERROR_PX, most=1000)
     found = pycolmap.estimate_relative_pose(camera, pixels[0], camera, pixels[1], options)
     if found is None or found["num_inliers"] < MIN_RELATIVE_MATCHES:
         return None

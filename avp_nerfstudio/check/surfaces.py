@@ -1,92 +1,17 @@
-"""What Open3D does with the frames' points: the fused cloud, their distance to the mesh, and point-to-plane ICP."""
+"""Frames' points held against surfaces, with Open3D: their distance to the mesh, and point-to-plane ICP."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from avp_habitat.poses import Intrinsics, pixel_directions
-from avp_habitat.rollout.format import Rollout
-from avp_habitat.rollout.images import read_rgb
 from avp_habitat.scenes.loader import Scene
-from avp_nerfstudio.check.agreement import TOLERANCE_M
+from avp_nerfstudio.check import Verdict
+from avp_nerfstudio.check.agreement import TOLERANCE_M, Cameras
 from avp_nerfstudio.check.depth_maps import DepthMaps
-from avp_nerfstudio.check.hypotheses import Cameras
-from avp_nerfstudio.check.verdict import Verdict
 
 Float = NDArray[np.floating]
-
-BAD_COLOUR = (255, 48, 48)
-"""Of frames that disagree."""
-GOOD_COLOUR = (64, 160, 255)
-"""Of all others."""
-FRUSTUM_M = 0.2
-_FRAMES = 400
-_POINTS = 2400
-
-
-@dataclass(frozen=True)
-class Cloud:
-    """Coloured points."""
-
-    points: Float
-    """`(m, 3)` metres, world frame."""
-    colours: NDArray[np.uint8]
-    """`(m, 3)` as photographed; those of frames that disagree are red."""
-
-
-def fuse(rollout: Rollout, maps: DepthMaps, cameras: Cameras, bad: NDArray[np.bool_]) -> Cloud:
-    """Back-project some points of every frame; of more than 400 frames, of those that are spread evenly."""
-    n = len(maps)
-    chosen = np.unique(np.linspace(0, n - 1, min(n, _FRAMES)).round().astype(int))
-    chosen = np.union1d(chosen, np.flatnonzero(bad)[:_FRAMES])
-    views = rollout.frames + rollout.heldout
-    points: list[Float] = []
-    colours: list[NDArray[np.uint8]] = []
-    for frame in chosen:
-        found, _ = maps.surface(int(frame), cameras.poses[frame], cameras.intrinsics, _POINTS)
-        picture = read_rgb(views[frame].image)[:: maps.stride, :: maps.stride].reshape(-1, 3)
-        colour = picture[maps.samples[frame, : len(found)]]
-        points.append(found)
-        colours.append(np.full_like(colour, BAD_COLOUR) if bad[frame] else colour)
-    return Cloud(np.concatenate(points), np.concatenate(colours))
-
-
-def frusta(cameras: Cameras, length_m: float = FRUSTUM_M) -> Float:
-    """`(n, 11, 3)` one line per camera that draws its pyramid of view, metres, world frame."""
-    k = cameras.intrinsics
-    # A camera of 2x2 pixels whose centres are the corners of the picture.
-    corners = pixel_directions(
-        Intrinsics(2, 2, k.fx / k.width, k.fy / k.height, k.cx / k.width + 0.5, k.cy / k.height + 0.5)
-    ).reshape(4, 3)
-    upper_left, upper_right, lower_left, lower_right = corners * length_m
-    tip = np.zeros(3)
-    line = np.stack([tip, upper_left, upper_right, tip, lower_right, lower_left, tip, upper_left])
-    line = np.concatenate([line, np.stack([lower_left, lower_right, upper_right])])
-    return np.einsum("nij,kj->nki", cameras.poses[:, :3, :3], line) + cameras.poses[:, None, :3, 3]
-
-
-def frustum_colours(bad: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """`(n, 3)` red for frames that disagree, blue for others."""
-    return np.where(bad[:, None], np.array(BAD_COLOUR), np.array(GOOD_COLOUR)).astype(np.uint8)
-
-
-def write_ply(path: Path, cloud: Cloud) -> None:
-    """Write the cloud as binary PLY with Open3D.
-
-    Raises:
-        OSError: it could not be written.
-    """
-    import open3d as o3d
-
-    written = o3d.geometry.PointCloud()
-    written.points = o3d.utility.Vector3dVector(cloud.points)
-    written.colors = o3d.utility.Vector3dVector(cloud.colours / 255)
-    if not o3d.io.write_point_cloud(str(path), written):  # pyright: ignore[reportArgumentType]
-        raise OSError(f"Open3D could not write {path.name}")
-
 
 POINTS = 300
 """Points of each frame, at most."""
@@ -94,20 +19,11 @@ NEAR_SHARE = 0.995
 """Least share of all points within 2 cm of the mesh; of ten correct rollouts in two rooms every point was."""
 NEAR_SHARE_OF_FRAME = 0.98
 """The same for each single frame."""
-_FRAMES_PER_CALL = 256
 
 
-@dataclass(frozen=True)
-class MeshDistance:
-    """Distances of points to the mesh."""
-
-    verdict: Verdict
-    """Whether they are on it."""
-    bad: NDArray[np.bool_]
-    """`(n,)` frames whose points are not."""
-
-
-def mesh_distance(maps: DepthMaps, cameras: Cameras, scene: Scene, *, named: str | None) -> MeshDistance:
+def mesh_distance(
+    maps: DepthMaps, cameras: Cameras, scene: Scene, *, named: str | None
+) -> tuple[Verdict, NDArray[np.bool_]]:
     """Measure the distance of every frame's points to a mesh.
 
     Args:
@@ -115,6 +31,9 @@ def mesh_distance(maps: DepthMaps, cameras: Cameras, scene: Scene, *, named: str
         cameras: poses and intrinsics.
         scene: the mesh.
         named: digest of the scene that `rollout.json` names, None where it names none.
+
+    Returns:
+        Whether they are on it, and `(n,)` frames whose points are not.
     """
     distances = _distances(maps, cameras, scene)
     near = (distances <= TOLERANCE_M).sum(axis=1)
@@ -123,7 +42,9 @@ def mesh_distance(maps: DepthMaps, cameras: Cameras, scene: Scene, *, named: str
     share = np.where(counts > 0, near / distances.shape[1], np.nan)
     bad = share < NEAR_SHARE_OF_FRAME
     judged = distances[counts > 0]
-    overall = float((judged <= TOLERANCE_M).mean()) if judged.size else float("nan")
+    overall = mean = p95 = float("nan")
+    if judged.size:
+        overall, mean, p95 = (judged <= TOLERANCE_M).mean(), judged.mean(), np.percentile(judged, 95)
     passed = not (overall < NEAR_SHARE or bad.any())
     text = (
         f"{100 * overall:.2f} % of {judged.size} points lie within 2 cm of {scene.name} (limit {100 * NEAR_SHARE} %); "
@@ -134,12 +55,12 @@ def mesh_distance(maps: DepthMaps, cameras: Cameras, scene: Scene, *, named: str
         text += "; the file is not the one that rollout.json names (another sha256)"
         cause = f"{scene.name} is not the scene in which the rollout was captured"
     figures = {
-        "near_2cm_percent": 100 * overall,
-        "mean_mm": 1000 * float(judged.mean()) if judged.size else float("nan"),
-        "p95_mm": 1000 * float(np.percentile(judged, 95)) if judged.size else float("nan"),
+        "near_2cm_percent": 100 * float(overall),
+        "mean_mm": 1000 * float(mean),
+        "p95_mm": 1000 * float(p95),
         "far_frames": float(bad.sum()),
     }
-    return MeshDistance(Verdict("mesh distance", passed, text, figures, None if passed else cause), bad)
+    return Verdict("mesh distance", passed, text, figures, None if passed else cause), bad
 
 
 def _distances(maps: DepthMaps, cameras: Cameras, scene: Scene) -> NDArray[np.float32]:
@@ -151,16 +72,11 @@ def _distances(maps: DepthMaps, cameras: Cameras, scene: Scene) -> NDArray[np.fl
         o3d.core.Tensor.from_numpy(np.ascontiguousarray(scene.mesh.vertices, np.float32)),
         o3d.core.Tensor.from_numpy(np.ascontiguousarray(scene.mesh.triangles, np.uint32)),
     )
-    found = []
-    for frames in np.array_split(np.arange(len(maps)), -(-len(maps) // _FRAMES_PER_CALL)):
-        rotation, centre = cameras.poses[frames, :3, :3], cameras.poses[frames, None, :3, 3]
-        world = maps.local_points(cameras.intrinsics, frames, POINTS) @ np.swapaxes(rotation, 1, 2) + centre
-        found.append(casting.compute_distance(o3d.core.Tensor.from_numpy(world.astype(np.float32))).numpy())
-    return np.concatenate(found)
+    local = maps.local_points(cameras.intrinsics, np.arange(len(maps)), POINTS)
+    world = local @ np.swapaxes(cameras.poses[:, :3, :3], 1, 2) + cameras.poses[:, None, :3, 3]
+    return casting.compute_distance(o3d.core.Tensor.from_numpy(world.astype(np.float32))).numpy()
 
 
-PARTNERS = 8
-"""Frames that a frame is registered to."""
 _SOURCE_POINTS = 1000
 _REACH_M, _CLOSE_M = 0.12, 0.03
 _LEAST_MATCHES = 100
@@ -189,17 +105,9 @@ class Correction:
 def register(
     maps: DepthMaps, cameras: Cameras, frame: int, partners: NDArray[np.int64], *, far: bool
 ) -> Correction | None:
-    """Register one frame to others that are believed.
+    """Register one frame to partners that are believed; None when these see too little of it.
 
-    Args:
-        maps: the depth.
-        cameras: poses and intrinsics.
-        frame: which to register.
-        partners: the others.
-        far: whether the frame may be off by centimetres; else only a few are looked for, which no corner can mislead.
-
-    Returns:
-        The correction, or None when too little of the frame is seen by the others.
+    `far` says that the frame may be off by centimetres; else only a few are looked for, which no corner can mislead.
     """
     import open3d as o3d
 

@@ -1,26 +1,38 @@
-"""A reconstruction as an MLflow run: its settings and origin, which run it is, and whose child."""
+"""What follows a training: its MLflow run (settings and origin, which run it is, and whose child), and a recording."""
 
 import dataclasses
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+# nerfstudio's modules import each other in circles; the trainer has to come before the writers.
+import nerfstudio.engine.trainer  # noqa: F401  isort: skip
+from nerfstudio.utils import writer
+from nerfstudio.utils.writer import EventName, Writer
+
 from avp_habitat.provenance import flat
 from avp_habitat.rollout.format import read_meta
 from avp_habitat.tracking import names, rollout_run
-from avp_habitat.tracking.deliver import finish
+from avp_habitat.tracking.deliver import finish, recover_in_background
 from avp_habitat.tracking.experiments import find_run
 from avp_habitat.tracking.journal import Journal, journal_of
 from avp_habitat.tracking.names import safe_name
-from avp_habitat.tracking.run import NewRun, TrackedRun, continue_run, join_run, may_continue, start_run
-from avp_habitat.tracking.stores import TrackingError, open_store
+from avp_habitat.tracking.run import NewRun, Status, TrackedRun, continue_run, join_run, may_continue, start_run
+from avp_habitat.tracking.stores import TrackingError, about_run, open_store
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
+Sink = Callable[[str, float, int], None]
+"""Takes name, value and iteration."""
+
+# Its remaining time counts down from the wrong end when a training is resumed, and nobody plots it.
+_DROPPED = {EventName.ETA.value}
+_EVERY_ITERATION = {EventName.ITER_TRAIN_TIME.value, EventName.TRAIN_RAYS_PER_SEC.value}
+_FILES = ("config.yml", "dataparser_transforms.json")
 RUN_FILE = "mlflow_run_id.txt"
 """In a training's folder: the id of its run."""
 # Of no meaning for the result; `mlflow` is an address, which may hold a password.
@@ -46,10 +58,7 @@ class Facts:
 
 
 def facts_of(config: Any) -> Facts:
-    """The facts of a training.
-
-    Args:
-        config: nerfstudio's `TrainerConfig`; its rollout, if it has one, is still where it says.
+    """The facts of a training, from its `TrainerConfig`; its rollout, if it has one, is still where it says.
 
     Raises:
         RolloutError: `rollout.json` or `steps.csv` cannot be read.
@@ -119,8 +128,7 @@ def open_run(
         address: of the store.
         facts: of the training.
         folder: of the training, where the run's id is remembered.
-        experiment: MLflow's, made when it does not exist; when neither named nor given by the runs above,
-            as `experiments.meant` says.
+        experiment: MLflow's, made when it does not exist.
         earlier: id of the run that is continued.
 
     Raises:
@@ -139,13 +147,7 @@ def open_run(
 def open_again(address: str, facts: Facts, *, folder: Path, experiment: str | None = None) -> tuple[TrackedRun, bool]:
     """The run of a training that ended, and whether it had one: a new run is made when it was not tracked.
 
-    A run that it had keeps the status and the settings that it has.
-
-    Args:
-        address: of the store.
-        facts: of the training.
-        folder: of the training.
-        experiment: of a new run.
+    A run that it had keeps the status and the settings that it has. The arguments are those of `open_run`.
 
     Raises:
         RolloutError: a rollout cannot be read.
@@ -209,3 +211,99 @@ def _new(address: str, facts: Facts, folder: Path, experiment: str | None, tags:
     run.metrics(facts.metrics, step=0)
     _remember(folder, run)
     return run
+
+
+class ScalarWriter(Writer):
+    """One of nerfstudio's event writers: hands the numbers that are kept to others."""
+
+    def __init__(self, sinks: Sequence[Sink], every: int) -> None:
+        """Hand each number to all `sinks`, those that arrive in each iteration only `every` so many iterations."""
+        self._sinks = tuple(sinks)
+        self._every = every
+
+    def write_scalar(self, name: str, scalar: Any, step: int) -> None:
+        """Hand a number on; a tensor of one element counts as one."""
+        if _is_kept(name, step, self._every):
+            for sink in self._sinks:
+                sink(name, float(scalar), step)
+
+    def write_image(self, name: str, image: Any, step: int) -> None:
+        """Nothing: pictures are rendered once, after the training."""
+
+    def write_config(self, name: str, config_dict: dict[str, Any], step: int) -> None:
+        """Nothing: settings are logged as facts of the run."""
+
+
+def _is_kept(name: str, step: int, every: int) -> bool:
+    """Nerfstudio logs times and learning rates in each iteration, losses every so many."""
+    each = name in _EVERY_ITERATION or name.startswith("learning_rate/")
+    return name not in _DROPPED and (not each or step % every == 0)
+
+
+def read_events(config: Any, folder: Path) -> Iterator[tuple[str, float, int, float]]:
+    """The numbers that a training's TensorBoard event files hold of those that are kept; none when it wrote none.
+
+    Yields:
+        nerfstudio's name, the value in nerfstudio's unit, the iteration, and seconds since 1970.
+    """
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    folder, every = folder / config.logging.relative_log_dir, max(int(config.logging.steps_per_log), 1)
+    if not any(folder.glob("events.out.tfevents.*")):
+        return
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    events.Reload()
+    for name in events.Tags()["scalars"]:
+        for event in events.Scalars(name):
+            if _is_kept(name, event.step, every):
+                yield name, event.value, event.step, event.wall_time
+
+
+class Trackers:
+    """The run and the recording of one training."""
+
+    def __init__(self, config: Any, address: str | None, pipeline: Any) -> None:
+        """Open what the options of an `AVPTrainerConfig` ask for; without an address there is no run.
+
+        Raises:
+            AVPError: the store or the recording cannot be used.
+        """
+        self._run: TrackedRun | None = None
+        self._writer: ScalarWriter | None = None
+        self._recording: Any = None
+        if config.rerun is not None:
+            from avp_nerfstudio.recording import ReconstructionRecording
+
+            self._recording = ReconstructionRecording(config.rerun, pipeline)
+        if address is None:
+            return
+        earlier = remembered_id(config.load_dir.parent) if config.load_dir is not None else None
+        experiment, folder = config.mlflow_experiment, config.get_base_dir()
+        self._run = run = open_run(address, facts_of(config), folder=folder, experiment=experiment, earlier=earlier)
+        print(about_run(run.run_id, run.address, delivered=not run.run_id.startswith(names.OFFLINE)))
+        recover_in_background()
+
+    def listen(self, every: int) -> None:
+        """Take nerfstudio's numbers from now on, those of each iteration only `every` so many."""
+        sinks: list[Sink] = [] if self._recording is None else [self._recording.scalar]
+        if (run := self._run) is not None:
+            sinks.append(lambda name, value, step: run.metrics({name: value}, step))
+        if sinks:
+            self._writer = ScalarWriter(sinks, every)
+            writer.EVENT_WRITERS.append(self._writer)
+
+    def close(self, status: Status, folder: Path) -> None:
+        """Take the numbers that nerfstudio still holds, keep the small files of the training's folder, end both."""
+        if self._writer in writer.EVENT_WRITERS:
+            writer.write_out_storage()
+            writer.EVENT_WRITERS.remove(self._writer)
+        run, self._run = self._run, None
+        recording, self._recording = self._recording, None
+        if recording is not None:
+            recording.close()
+            print(f"recording: {recording.path}")
+        if run is not None:
+            for path in (folder / name for name in _FILES):
+                if path.is_file():
+                    run.file(path)
+            print(about_run(run.run_id, run.address, delivered=run.close(status)))

@@ -1,1 +1,0 @@
-"""Trainings of nerfstudio as MLflow runs and Rerun recordings."""
