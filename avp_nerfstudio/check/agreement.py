@@ -69,8 +69,7 @@ class Agreement:
     def among(self, kept: Mask) -> "Agreement":
         """What `(n,)` kept frames say of each other."""
         between = kept[self.pairs.sources] & kept[self.pairs.targets][:, None]
-        counts = (self.agreeing, self.contradicting, self.deviation_m)
-        return Agreement(self.pairs, *(count * between for count in counts))
+        return Agreement(self.pairs, self.agreeing * between, self.contradicting * between, self.deviation_m * between)
 
     def compared(self) -> int:
         """Number of comparable points."""

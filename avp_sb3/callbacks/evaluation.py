@@ -21,7 +21,7 @@ from avp_sb3.evaluation.policy import Episode
 from avp_sb3.vec_env.batched import AVPVecEnv, Scenes, scenes_given
 from avp_sb3.vec_env.subproc import AVPSubprocVecEnv
 
-DEFAULT_SCENES: Scenes = ("builtin:7",)
+DEFAULT_SCENES = ("builtin:7",)
 DEFAULT_EVERY, DEFAULT_EPISODES = 150_000, 10
 """About 0.7 % of a training with Table 4's values and tables; whoever evaluates more often pays in proportion."""
 _NO_PICTURES = ("stdout", "log", "json", "csv")

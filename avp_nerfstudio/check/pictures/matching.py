@@ -206,7 +206,8 @@ def _verify(unverified: Matches, *, progress: bool) -> list[PairMatches]:
     options = ransac_options(VERIFY_MAX_ERROR_PX, most=2000)
 
     def verified(pair: PairMatches) -> PairMatches | None:
-        found = pycolmap.estimate_fundamental_matrix(*unverified.pixels(pair), options)
+        first, second = unverified.pixels(pair)
+        found = pycolmap.estimate_fundamental_matrix(first, second, options)
         if found is None or found["num_inliers"] < MIN_MATCHES:
             return None
         return replace(pair, features=pair.features[np.asarray(found["inlier_mask"], dtype=bool)])
