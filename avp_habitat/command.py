@@ -18,7 +18,7 @@ INTERRUPTED = 130
 Options = TypeVar("Options")
 
 
-def parse(options: type[Options], argv: Sequence[str], *, prog: str | None = None) -> Options:
+def parse(options: type[Options], argv: Sequence[str]) -> Options:
     """Read a command line into a dataclass: tyro makes `--flag` from the field `flag`, and `--help` from docstrings.
 
     A field without a default is required, `tyro.conf.Positional[Path]` has no flag, a nested dataclass gives its
@@ -35,7 +35,7 @@ def parse(options: type[Options], argv: Sequence[str], *, prog: str | None = Non
     how = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
     try:
         with redirect_stderr(said):
-            return tyro.cli(options, args=list(argv), prog=prog or _program(), config=how)
+            return tyro.cli(options, args=list(argv), prog=_program(), config=how)
     except SystemExit as end:
         if not end.code:
             raise

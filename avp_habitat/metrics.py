@@ -206,7 +206,7 @@ def path_length(start: Float, positions: Float) -> float:
 CONFIDENCE = 0.95
 
 
-def mean_and_half_width(values: ArrayLike, *, confidence: float = CONFIDENCE) -> tuple[NDArray, NDArray]:
+def mean_and_half_width(values: ArrayLike) -> tuple[NDArray, NDArray]:
     """Mean of `(n, ...)` values over n episodes or runs, and half the width of its confidence interval, `(...)` each.
 
     By Student's t with n - 1 degrees; nan for one episode, of whose spread nothing is known.
@@ -219,4 +219,4 @@ def mean_and_half_width(values: ArrayLike, *, confidence: float = CONFIDENCE) ->
     if n < 2:
         return mean, np.full_like(mean, np.nan)
     error = values.std(axis=0, ddof=1) / np.sqrt(n)
-    return mean, stats.t.ppf((1 + confidence) / 2, n - 1) * error
+    return mean, stats.t.ppf((1 + CONFIDENCE) / 2, n - 1) * error

@@ -16,6 +16,8 @@ from avp_habitat.ranges import Range, number
 Float = NDArray[np.floating]
 
 _SIDE, _HFOV_DEG = Range(1, 16_384), Range(0.001, 179)
+# Largest accepted deviation of R Rᵀ from the identity, and of a pose's last row.
+_RIGID = 1e-4
 _FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 
@@ -154,21 +156,18 @@ def unproject(depth: Float, pose: Float, intrinsics: Intrinsics) -> Float:
     return local @ pose[:3, :3].T + pose[:3, 3]
 
 
-def rigidity_fault(pose: Float, tolerance: float = 1e-4) -> str | None:
-    """Why a matrix is not a rigid camera_to_world, in words, or None when it is one.
-
-    The tolerance is the largest accepted deviation of R Rᵀ from the identity and of the last row.
-    """
+def rigidity_fault(pose: Float) -> str | None:
+    """Why a matrix is not a rigid camera_to_world, in words, or None when it is one."""
     pose = np.asarray(pose)
     if pose.shape != (4, 4):
         return f"expected a 4x4 matrix, got shape {pose.shape}"
     if not np.isfinite(pose).all():
         return "expected finite numbers, got NaN or infinity"
-    if np.abs(pose[3] - [0, 0, 0, 1]).max() > tolerance:
+    if np.abs(pose[3] - [0, 0, 0, 1]).max() > _RIGID:
         return f"expected the last row 0 0 0 1, got {' '.join(f'{x:g}' for x in pose[3])}"
     rotation = pose[:3, :3]
     determinant = float(np.linalg.det(rotation))
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > tolerance:
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID:
         return f"expected a rotation, got a matrix with determinant {determinant:.3f} that is not orthonormal"
     if determinant < 0:
         return f"expected a rotation, got a reflection (determinant {determinant:.3f}); was one axis flipped?"

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 SKIN_M = 1e-4
 """Distance in metres at which agents stop before a wall, so that every later test against it is safe from rounding."""
+_BIN_M = 0.25
 
 
 class Walls(NamedTuple):
@@ -36,20 +37,15 @@ class Walls(NamedTuple):
     """Indices of walls, bin after bin."""
 
 
-def make_walls(rings: list[NDArray[np.float64]], bin_m: float = 0.25) -> Walls:
-    """Walls along closed rings.
-
-    Args:
-        rings: `(k, 2)` corners (x, z) in metres each, the inside on the left.
-        bin_m: side of a bin in metres.
-    """
+def make_walls(rings: list[NDArray[np.float64]]) -> Walls:
+    """Walls along closed rings: `(k, 2)` corners (x, z) in metres each, the inside on the left."""
     ends = np.concatenate([np.hstack([ring, np.roll(ring, -1, axis=0)]) for ring in rings])
     ends = np.ascontiguousarray(ends[np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1]) > 0])
     corners = ends[:, :2]
-    origin = corners.min(axis=0) - bin_m / 2
-    columns, rows = (int(n) for n in np.ceil((corners.max(axis=0) + bin_m / 2 - origin) / bin_m))
-    first, member = _fill_bins(ends, origin, bin_m, (rows, columns))
-    return Walls(ends, origin, bin_m, (rows, columns), first, member)
+    origin = corners.min(axis=0) - _BIN_M / 2
+    columns, rows = (int(n) for n in np.ceil((corners.max(axis=0) + _BIN_M / 2 - origin) / _BIN_M))
+    first, member = _fill_bins(ends, origin, _BIN_M, (rows, columns))
+    return Walls(ends, origin, _BIN_M, (rows, columns), first, member)
 
 
 @njit(cache=True)

@@ -59,11 +59,11 @@ class Sender:
                 return False
         return True
 
-    def stop(self, timeout_s: float = 5.0) -> bool:
+    def stop(self) -> bool:
         """End the thread; whether it ended, which a call that hangs may prevent."""
         self._stopped.set()
         self._hurry.set()
-        self._thread.join(timeout_s)
+        self._thread.join(5.0)
         return not self._thread.is_alive()
 
     def _work(self) -> None:

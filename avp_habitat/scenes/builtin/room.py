@@ -101,9 +101,9 @@ class _Voxels:
             total += weight * grid[at[:, 0], at[:, 1], at[:, 2]]
         return total
 
-    def clear_view(self, points: Float, light: Float, steps: int = 14) -> NDArray[np.float32]:
+    def clear_view(self, points: Float, light: Float) -> NDArray[np.float32]:
         """Share of light that reaches `(n, 3)` points from a `(3,)` point past what is filled."""
-        grid = self.soft[1]
+        grid, steps = self.soft[1], 14
         through = np.ones(len(points), np.float32)
         for step in range(1, steps):
             at = self._index(points + (light - points) * (step / steps))

@@ -21,6 +21,7 @@ MIN_PARALLAX_PX = 3.0
 MIN_RELATIVE_MATCHES = 60
 MAX_ERROR_PX = 1.5
 PAIRS_OF_A_FRAME = 6
+_STACKED = 60
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,9 @@ class Stacked:
     """`(2, m, 2)` pixels in the first and in the second picture."""
 
 
-def stack_matches(matches: Matches, *, limit: int = 60) -> Stacked:
-    """At most `limit` matches of each pair, evenly chosen, side by side."""
-    pixels = [matches.pixels(pair)[:, :: -(-len(pair.features) // limit)] for pair in matches.pairs]
+def stack_matches(matches: Matches) -> Stacked:
+    """At most 60 matches of each pair, evenly chosen, side by side."""
+    pixels = [matches.pixels(pair)[:, :: -(-len(pair.features) // _STACKED)] for pair in matches.pairs]
     counts = np.array([part.shape[1] for part in pixels], dtype=int)
     return Stacked(
         np.repeat(np.arange(len(pixels)), counts),
