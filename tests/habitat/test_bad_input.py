@@ -69,7 +69,7 @@ MISTAKES = [
     (
         "--scene room.glb --navmesh nose.navmesh",
         1,
-        r"nose\.navmesh: no such NavMesh file .*; did you mean noise\.navmesh\?",
+        r"nose\.navmesh: no such NavMesh file .*; did you mean 'noise\.navmesh'\?",
     ),
     (
         "--scene room.glb --navmesh folder.navmesh",
