@@ -69,15 +69,16 @@ def main(options: Log) -> None:
         TrackingError: MLflow cannot be reached or refuses.
         UsageError: the recording or the output folder cannot be written.
     """
+    from avp_nerfstudio import plugin  # noqa: F401 - leaves out what nerfstudio makes torch say
+    from avp_nerfstudio.method.checkpoints import config_path, open_trained, read_config
+
+    path = config_path(options.config)
     # nerfstudio's scripts come first: its modules import each other in circles, and this way round is its own.
     import nerfstudio.scripts.eval  # noqa: F401
-
-    from avp_nerfstudio.method.checkpoints import config_path, open_trained, read_config
 
     address = address_of(options.mlflow, default=DEFAULT_ADDRESS)
     if address is not None:
         open_store(address)  # before anything is rendered, which takes long
-    path = config_path(options.config)
     config = read_config(path)
     output = options.output or path.parent / "heldout"
     try:

@@ -1,6 +1,7 @@
 import json
 import math
 import re
+from pathlib import Path
 
 import mlflow
 import numpy as np
@@ -139,6 +140,7 @@ def test_the_picture_shows_the_policies_that_have_a_reconstruction_in_their_colo
         (["--mlflow", "off"], 2, "--mlflow: expected an address or auto, got off"),
         (["--mlflow", "http://127.0.0.1:9"], 1, "MLflow at http://127.0.0.1:9 cannot be used"),
         (["--mlflow", "mango://here"], 1, "MLflow at mango://here cannot be used"),
+        (["--mlflow", "sqlite:///mlfow.db"], 1, "MLflow at sqlite:///mlfow.db cannot be used: .*No such file"),
         (["--out", "."], 2, "--out .: exists already"),
         (["--out", "mlflow.db/out"], 2, "--out mlflow.db/out: cannot write there"),
     ],
@@ -148,6 +150,7 @@ def test_wrong_input_is_one_line(experiment, capsys, words, code, error):
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert re.search(error, lines[0])
+    assert not Path("mlfow.db").exists()
 
 
 def test_an_experiment_without_figures_says_what_makes_them(store, capsys):

@@ -1,6 +1,8 @@
 import json
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -205,6 +207,15 @@ def test_a_missing_or_foreign_config_is_named(tmp_path, capsys):
         assert told.startswith(f"error: {tmp_path / name}: ")
         assert text in told
         assert told.count("\n") == 1
+
+
+def test_nothing_but_the_error_is_said(tmp_path):
+    (tmp_path / "config.yml").write_text("a: 1\n")
+    line = [sys.executable, "-m", "avp_nerfstudio.log", tmp_path / "config.yml", "--mlflow", "off"]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
 
 
 def test_a_missing_checkpoint_is_named(copy, capsys):

@@ -94,6 +94,13 @@ def test_wrong_options_of_the_training_end_before_anything_is_made(refused, tmp_
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_file_that_is_no_model_cannot_go_on(refused, tmp_path):
+    (tmp_path / "notes.txt").write_text("no model")
+    code, said = refused("--resume", "notes.txt", "--width", 16, "--height", 12, "--agents", 16)
+    assert code == 1
+    assert "notes.txt: expected a model of Stable-Baselines3" in said
+
+
 def test_a_scene_that_cannot_be_evaluated_ends_before_a_run_or_a_model_is_made(refused, tmp_path):
     (tmp_path / "model.zip").write_text("an earlier one")
     words = ("--out", "model.zip", "--width", 16, "--height", 12, "--agents", 16, "--eval-scene", "no.glb")

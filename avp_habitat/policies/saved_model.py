@@ -179,9 +179,9 @@ def _pickles(path: Path, without: Collection[str]) -> list[BinaryIO]:
 
 
 def _expected(path: Path) -> str:
-    if path.suffix == ".zip":
-        return f"expected a model of Stable-Baselines3 or sb3-contrib ({', '.join(ALGORITHMS)})"
-    return "expected the statistics of Stable-Baselines3's VecNormalize"
+    if path.suffix == ".pkl":
+        return "expected the statistics of Stable-Baselines3's VecNormalize"
+    return f"expected a model of Stable-Baselines3 or sb3-contrib ({', '.join(ALGORITHMS)})"
 
 
 def algorithm_of(path: Path) -> str:

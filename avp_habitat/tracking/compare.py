@@ -200,7 +200,8 @@ def main(options: CompareRuns) -> None:
     address = str(stores.address_of(options.mlflow, default=stores.DEFAULT_ADDRESS))
     if options.out is not None:
         check_new(options.out, option="--out")
-    client = stores.connect(address)
+    # A misspelt name makes no database.
+    client = stores.connect(address, make=False)
     try:
         experiment = find_experiment(client, *(chosen := chosen_experiment(options.experiment)))
         if experiment is None:
