@@ -85,12 +85,12 @@ def test_space_is_carved_by_depth_before_training_and_only_then(room, tmp_path):
     wall = measured_points(dataset.cameras, 0, dataset[0]["depth_image"])[:1]
     carved = model(room, tmp_path / "a")
     for density in densities(carved, middle):
-        assert float(density) == 0.0
+        assert density.item() == 0.0
     for density in densities(carved, wall):
-        assert float(density) > 0.0
+        assert density.item() > 0.0
     for options in ({"use_depth": False}, {"carving_voxel_m": 0.0}):
         for density in densities(model(room, tmp_path / "b", **options), middle):
-            assert float(density) > 0.0
+            assert density.item() > 0.0
 
 
 @pytest.mark.parametrize("view_dependent", [False, True])

@@ -288,7 +288,7 @@ OFF_POLICY = {"buffer_size": 64, "learning_starts": 8}
         (A2C, "MlpPolicy", {}),
         (DQN, "MlpPolicy", OFF_POLICY),
         (sb3_contrib.QRDQN, "MlpPolicy", OFF_POLICY),
-        (sb3_contrib.TRPO, "MlpPolicy", {"n_steps": 8}),
+        (sb3_contrib.TRPO, "MlpPolicy", {"n_steps": 8, "batch_size": 8}),
         (sb3_contrib.RecurrentPPO, "MlpLstmPolicy", {"n_steps": 8}),
         (sb3_contrib.ARS, "LinearPolicy", {"n_delta": 1}),
     ],
@@ -322,7 +322,7 @@ def test_statistics_beside_an_off_policy_model_are_its_own(tmp_path):
 
 
 def test_the_package_that_a_model_needs_is_named(tmp_path, monkeypatch):
-    sb3_contrib.TRPO("MlpPolicy", SmallEnv(), device="cpu", n_steps=8).save(tmp_path / "m.zip")
+    sb3_contrib.TRPO("MlpPolicy", SmallEnv(), device="cpu", n_steps=8, batch_size=8).save(tmp_path / "m.zip")
     monkeypatch.setitem(sys.modules, "sb3_contrib", None)
     with pytest.raises(PolicyError, match=r"m\.zip: TRPO needs sb3_contrib; .* `pip install sb3-contrib`"):
         make_policy(str(tmp_path / "m.zip"), SmallEnv(), 0)

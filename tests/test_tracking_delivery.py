@@ -182,6 +182,21 @@ def test_programs_that_make_one_database_at_once_do_not_break_each_other(address
             assert sorted(p.step for p in client.get_metric_history(run, name)) == list(range(300))
 
 
+def test_what_mlflow_refuses_is_told_and_holds_up_nothing_else(address, monkeypatch, caplog):
+    """As a server does whose limits are lower than ours."""
+    run = start_run(address, NewRun(), interval_s=0.01)
+    assert run.flush()
+    monkeypatch.setenv("MLFLOW_TRUNCATE_LONG_VALUES", "false")
+    monkeypatch.setattr("mlflow.utils.validation.MAX_PARAM_VAL_LENGTH", 10)
+    run.params({"a": "short", "b": "x" * 20, "c": "short"})
+    run.metrics({"d": 1.0}, 1)
+    assert run.close("FINISHED")
+    found = MlflowClient(address).get_run(run.run_id)
+    assert (found.data.params, found.data.metrics) == ({"a": "short", "c": "short"}, {"d": 1.0})
+    assert found.info.status == "FINISHED"
+    assert [record.message for record in caplog.records if f"run {run.run_id} refuses params 'b': " in record.message]
+
+
 def test_a_locked_database_delays_points_and_loses_none(address, tmp_path):
     import sqlite3
 

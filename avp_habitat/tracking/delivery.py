@@ -141,9 +141,25 @@ class Sender:
         # MLflow takes so many at a time.
         for kind, (entity, items, most) in kinds.items():
             for start in range(0, len(items), most):
-                batch: Any = {kind: [entity(*one) for one in items[start : start + most]]}
-                self._client.log_batch(self._run_id, **batch)
-                self._answers += 1
+                self._send_batch(kind, [entity(*one) for one in items[start : start + most]])
+
+    def _send_batch(self, kind: str, batch: list[Any]) -> None:
+        """Send metrics, parameters or tags; one that MLflow refuses, as too long perhaps, is told and left out."""
+        from mlflow.exceptions import MlflowException
+
+        try:
+            self._client.log_batch(self._run_id, **{kind: batch})
+            self._answers += 1
+        except MlflowException as error:
+            # MLflow says the same of a run that was deleted: then everything stays in the journal.
+            wrong = error.error_code in ("INVALID_PARAMETER_VALUE", "BAD_REQUEST")
+            if not wrong or self._client.get_run(self._run_id).info.lifecycle_stage != "active":
+                raise
+            if len(batch) == 1:
+                _log.warning("MLflow run %s refuses %s %r: %s", self._run_id, kind, batch[0].key, first_line(error))
+                return
+            for half in (batch[: len(batch) // 2], batch[len(batch) // 2 :]):
+                self._send_batch(kind, half)
 
     def _send_file(self, source: Path, path: str) -> None:
         folder = PurePosixPath(path).parent.as_posix()
