@@ -147,8 +147,9 @@ class Sender:
         """Send metrics, parameters or tags; one that MLflow refuses, as too long perhaps, is told and left out."""
         from mlflow.exceptions import MlflowException
 
+        named: Any = {kind: batch}
         try:
-            self._client.log_batch(self._run_id, **{kind: batch})
+            self._client.log_batch(self._run_id, **named)
             self._answers += 1
         except MlflowException as error:
             # MLflow says the same of a run that was deleted: then everything stays in the journal.
