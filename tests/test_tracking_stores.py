@@ -86,10 +86,17 @@ def test_a_deleted_experiment_is_named_with_the_way_back(store, monkeypatch, cap
     assert experiment_id(store, *chosen_experiment(None)) == identity
 
 
+CONNECT = """
+from avp_habitat import command
+from avp_habitat.tracking.stores import connect
+command.run(lambda words: connect(words[0]))
+"""
+
+
 def looked_at(address, *before, **options):
-    """What `compare` says of a store in one line, and the seconds that it took to say so."""
+    """What a command that logs to a store says of it in one line, and the seconds that it took to say so."""
     began = time.monotonic()
-    words = [*before, sys.executable, "-m", "avp_habitat.tracking.compare", "--mlflow", address]
+    words = [*before, sys.executable, "-c", CONNECT, address]
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(words, env=env, capture_output=True, text=True, timeout=300, **options)
     (line,) = done.stderr.splitlines()
