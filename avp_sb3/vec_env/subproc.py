@@ -1,12 +1,16 @@
 """Many agents as one Stable-Baselines3 `VecEnv` over several processes, each with a simulator of its own."""
 
+import os
 import signal
+import socket
 import time
 import traceback
+import weakref
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -35,8 +39,9 @@ class _Agents(gymnasium.Env):
     """What a worker holds: some agents in one scene, behind the protocol of SB3's workers for one environment."""
 
     def __init__(self, settings: TaskSettings, **options: Any) -> None:
-        # Ctrl-C is left to the parent, which ends its workers.
+        # Ctrl-C is left to the parent, which ends its workers; without one, an answer ends them without a traceback.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
         self.observation_space, self.action_space = make_observation(settings).space, action_space()
         self._open = partial(AVPVecEnv, settings=settings, **options)
         self._agents: AVPVecEnv | None = None
@@ -120,6 +125,8 @@ class AVPSubprocVecEnv(SubprocVecEnv):
         try:
             with self._named_death(0, _GUARD):
                 super().__init__(makes, start_method=start_method)
+            # A program that is interrupted, or never closes.
+            weakref.finalize(self, _end, self.remotes, self.processes)
             # SB3 has counted the workers.
             VecEnv.__init__(self, agents, self.observation_space, self.action_space)
             self._fixed = {name: self._of_agents(self._workers, "get_attr", name) for name in _FIXED}
@@ -155,9 +162,7 @@ class AVPSubprocVecEnv(SubprocVecEnv):
         """End the workers, also those that do not answer."""
         if not self.closed:
             self.closed = True
-            for pipe in self.remotes:
-                pipe.close()
-            _end(self.processes)
+            _end(self.remotes, self.processes)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """An attribute of the chosen agents, as separate `AVPEnv`s have it; `simulator` stays in its process."""
@@ -259,8 +264,12 @@ def _how_it_ended(process: BaseProcess) -> str:
     return f"was killed by {name}{by_whom}"
 
 
-def _end(processes: Sequence[BaseProcess]) -> None:
-    """Wait for processes whose pipes are closed, and kill those that have not ended after a while."""
+def _end(pipes: Sequence[Connection], processes: Sequence[BaseProcess]) -> None:
+    """Let workers find the end of their pipes, and kill those that have not ended after a while."""
+    for pipe in pipes:
+        # One that is closed over an answer which nobody has read is an error in its worker.
+        with suppress(OSError), socket.socket(fileno=os.dup(pipe.fileno())) as end:
+            end.shutdown(socket.SHUT_RDWR)
     until = time.monotonic() + _GRACE_S
     for process in processes:
         process.join(max(0.0, until - time.monotonic()))
@@ -268,3 +277,5 @@ def _end(processes: Sequence[BaseProcess]) -> None:
         if process.is_alive():
             process.kill()
             process.join()
+    for pipe in pipes:
+        pipe.close()
