@@ -152,8 +152,8 @@ class Sender:
             self._client.log_batch(self._run_id, **named)
             self._answers += 1
         except MlflowException as error:
-            # MLflow says the same of a run that was deleted: then everything stays in the journal.
-            wrong = error.error_code in ("INVALID_PARAMETER_VALUE", "BAD_REQUEST")
+            # MLflow says the same of a run that was deleted, and a proxy's 400 is another code: then everything stays.
+            wrong = error.error_code == "INVALID_PARAMETER_VALUE"
             if not wrong or self._client.get_run(self._run_id).info.lifecycle_stage != "active":
                 raise
             if len(batch) == 1:
