@@ -307,7 +307,8 @@ def test_every_installed_program_works_on_a_checkpoint(walk, tmp_path, shared, m
     cloud = ["--num-points", 1000, "--num-rays-per-batch", 512, "--normal-method", "open3d", "--output-dir", tmp_path]
     succeeded(executable("ns-export", "pointcloud", *load, *cloud, environment=weights))
     assert len(points_and_normals(tmp_path / "point_cloud.ply")[0]) > 500
-    succeeded(executable("ns-export", "poisson", *load, *cloud, "--texture-method", "point_cloud"))
+    texture = ["--texture-method", "point_cloud"]
+    succeeded(executable("ns-export", "poisson", *load, *cloud, *texture, environment=weights))
     assert triangles(tmp_path / "poisson_mesh.ply") > 100
     more = ["--load-dir", config.parent / "nerfstudio_models", *data]
     resumed = train(executable, tmp_path, method, *more, iterations=2, timestamp="more", environment=weights)
