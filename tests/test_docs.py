@@ -184,7 +184,9 @@ def test_a_docstring_that_names_a_parameter_that_is_not_there_ends_the_build(tmp
         shutil.copy(ROOT / name, tmp_path)
     source = tmp_path / "avp_habitat/metrics.py"
     text = source.read_text(encoding="utf-8")
-    source.write_text(text.replace("images: number of captured", "pictures: number of captured"), encoding="utf-8")
+    wrong = text.replace("lengths: `(n,)` their", "durations: `(n,)` their")
+    assert wrong != text
+    source.write_text(wrong, encoding="utf-8")
     done = build(tmp_path, tmp_path / "site")
     assert done.returncode != 0
-    assert "'pictures' does not appear in the function signature" in done.stderr
+    assert "'durations' does not appear in the function signature" in done.stderr
