@@ -183,10 +183,10 @@ def test_a_docstring_that_names_a_parameter_that_is_not_there_ends_the_build(tmp
     for name in ("mkdocs.yml", "CONTRIBUTING.md"):
         shutil.copy(ROOT / name, tmp_path)
     source = tmp_path / "avp_habitat/metrics.py"
-    text = source.read_text(encoding="utf-8")
-    wrong = text.replace("lengths: `(n,)` their", "durations: `(n,)` their")
-    assert wrong != text
-    source.write_text(wrong, encoding="utf-8")
+    with source.open("a", encoding="utf-8") as file:
+        file.write(
+            '\n\ndef added(images: int) -> int:\n    """Something.\n\n    Args:\n        pictures: one.\n    """\n'
+        )
     done = build(tmp_path, tmp_path / "site")
     assert done.returncode != 0
-    assert "'durations' does not appear in the function signature" in done.stderr
+    assert "'pictures' does not appear in the function signature" in done.stderr
