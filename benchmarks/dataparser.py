@@ -88,6 +88,7 @@ def lengthened(source: Path, folder: Path, frames: int) -> int:
     """
     available, size = len(read_rollout(source).frames), 0
     shutil.copytree(source / "heldout", folder / "heldout")
+    shutil.copy(source / "floor.png", folder)
     for kind, suffix in (("images", ".png"), ("depth", ".png"), ("poses", ".txt")):
         (folder / kind).mkdir()
         for index in range(frames):
