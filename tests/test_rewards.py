@@ -31,6 +31,8 @@ CONSTANTS = RewardConstants(
     alpha=0.13,
     alpha_proposed=0.71,
     alpha_surface=0.83,
+    alpha_multiview=0.17,
+    single_weight=0.35,
     beta=0.6,
     visit_decay=0.4,
     spread=0.17,
@@ -59,6 +61,9 @@ def random_facts(seed, n=6):
         stop_chosen=rng.random(n) < 0.5,
         coverage=rng.uniform(0.6, 1.0, n),
         steps_left=rng.integers(0, 80, n),
+        new_parallax=rng.uniform(0, 90, n),
+        surface=rng.uniform(0, 1, n),
+        parallax=rng.uniform(0, 1, n),
     )
 
 
@@ -80,6 +85,13 @@ def by_hand(name, facts, i):
     discount = 1 + c.visit_decay * int(facts.earlier_visits[i])
     if name == "surface":
         new = {"surface": c.alpha_surface / discount * float(facts.new_surface[i]) ** c.beta}
+        stop = c.stop_bonus * float(facts.surface[i]) if facts.stop_chosen[i] else 0.0
+    elif name == "multiview":
+        w = c.single_weight
+        grown = w * float(facts.new_surface[i]) + (1 - w) * float(facts.new_parallax[i])
+        new = {"multiview": c.alpha_multiview / discount * grown**c.beta}
+        share = w * float(facts.surface[i]) + (1 - w) * float(facts.parallax[i])
+        stop = c.stop_bonus * share if facts.stop_chosen[i] else 0.0
     else:
         new = {"coverage": c.alpha_proposed / discount * int(facts.new_cells[i]) ** c.beta}
     return new | {"spread": spread, "step": -c.step, "collision": collision, "redundancy": redundancy, "stop": stop}
@@ -95,15 +107,18 @@ def test_every_part_equals_the_formula_by_hand(name, seed):
         assert {part: values[i] for part, values in parts.items()} == pytest.approx(expected)
 
 
-def test_only_the_proposed_and_the_surface_reward_have_a_stop():
-    assert [name for name in REWARDS if has_stop(find_reward(name))] == ["proposed", "surface"]
+def test_only_the_papers_ablations_have_no_stop():
+    assert [name for name in REWARDS if not has_stop(find_reward(name))] == ["coverage", "coverage_redundancy"]
 
 
-def test_stopping_needs_the_choice_and_the_coverage():
+def test_stopping_needs_the_choice_and_in_proposed_the_coverage():
     facts = dataclasses.replace(
         random_facts(0, 3), stop_chosen=np.array([True, True, False]), coverage=np.array([0.8, 0.79, 0.9])
     )
-    assert stops_episode(facts, CONSTANTS).tolist() == [True, False, False]
+    ends = {name: stops_episode(find_reward(name), facts, CONSTANTS).tolist() for name in REWARDS}
+    assert ends["proposed"] == [True, False, False]
+    assert ends["surface"] == ends["multiview"] == [True, True, False]
+    assert ends["coverage"] == [False] * 3
 
 
 def test_the_default_constants_follow_the_design():

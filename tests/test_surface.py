@@ -8,7 +8,7 @@ from avp_habitat.sight.bits import unpack
 from avp_habitat.sight.rules import view_quality
 from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.surface.map import CELL_M, FULL, GROUPS, SIDE, SurfaceMapper
-from avp_habitat.surface.memory import raise_quality, surface_tables
+from avp_habitat.surface.memory import surface_tables
 from avp_habitat.surface.points import EDGE_M, SceneSurface, scene_surface
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.settings import TaskSettings
@@ -164,14 +164,6 @@ def test_tasks_on_one_simulator_share_tables_and_a_lower_camera_has_its_own(room
     settings = TaskSettings(reward="surface", lookup=True)
     assert surface_tables(room, settings) is surface_tables(room, TaskSettings(observation="surface_map", width=20))
     assert surface_tables(room, settings) is not surface_tables(room, TaskSettings(sensor_height_m=1.2))
-
-
-def test_growth_is_entered_and_summed_by_agent():
-    quality = np.array([[0.5, 0.0, 0.2], [0.0, 0.0, 0.0], [0.1, 0.1, 0.1]], dtype=np.float32)
-    pairs = np.array([0, 0, 1]), np.array([0, 2, 1])
-    grown = raise_quality(quality, np.array([2, 0]), *pairs, np.array([0.4, 0.2, 0.9], dtype=np.float32))
-    np.testing.assert_allclose(grown, [0.4, 0.9], atol=1e-6)
-    np.testing.assert_allclose(quality, [[0.5, 0.9, 0.2], [0, 0, 0], [0.4, 0.1, 0.2]], atol=1e-6)
 
 
 @pytest.mark.parametrize(("reward", "observation"), [("proposed", "map"), ("coverage", "numbers")])

@@ -8,8 +8,8 @@ arrays in the innermost loop would cost half as much again.
 import numpy as np
 
 from avp_habitat.compiled import njit
-from avp_habitat.sight.bits import ONE
-from avp_habitat.sight.rules import in_view, quality
+from avp_habitat.sight.bits import ONE, lowest
+from avp_habitat.sight.rules import in_view, parallax_square, quality
 
 
 @njit(cache=True)
@@ -53,37 +53,102 @@ def new_cells(visible, slots, pose, centres, camera, max_range, rows, steps, fir
 
 
 @njit(cache=True)
-def new_surface(visible, slots, pose, points, normals, camera, max_range, rows, best):
-    """Raise the qualities of the surface points that agents' views show better than before.
+def new_surface(visible, slots, pose, points, normals, camera, max_range, rows, best, pairing, number):
+    """Raise the qualities of the surface points that agents' views show better than before, or from elsewhere.
 
-    Args as of `new_cells`, but for the points' `(m, 3)` unit `normals` and `best`, `(n, m)` greatest quality so far; it
-    is written for points that all four places see.
+    Args as of `new_cells`, but for the points' `(m, 3)` unit `normals`, and those of `raise_point`: the arrays `best`
+    and `pairing`, written for points that all four places see, and `(k,)` the `number` of each agent's eye.
 
     Returns:
-        `(k,)` by how much it grew in sum, `(p, 2)` pairs (index of the agent, point) on which the places differ, and
-        `(p,)` the quality of those pairs' views.
+        `(k, 2)` by how much Q and S grew in sum, `(p, 2)` pairs (index of the agent, point) on which the places differ,
+        and `(p,)` the quality of those pairs' views.
     """
-    grown, count = np.zeros(len(slots)), 0
+    grown, count = np.zeros((len(slots), 2)), 0
     pairs, values = np.empty((len(points), 2), np.int64), np.empty(len(points), np.float32)
     for k in range(len(slots)):
         if count + len(points) > len(pairs):
             pairs = np.concatenate((pairs, np.empty_like(pairs)))
             values = np.concatenate((values, np.empty_like(values)))
         a, b, c, d = visible[slots[k, 0]], visible[slots[k, 1]], visible[slots[k, 2]], visible[slots[k, 3]]
-        known, eye = best[rows[k]], pose[k, :3, 3]
+        eye, row = pose[k, :3, 3], rows[k]
         for word in range(visible.shape[1]):
             some = a[word] | b[word] | c[word] | d[word]
             every = a[word] & b[word] & c[word] & d[word]
             point = 64 * word
             while some != 0:
-                if some & ONE and known[point] < 1 and in_view(pose[k], points[point], camera, max_range):
+                if (
+                    some & ONE
+                    and may_grow(row, point, np.float32(1.0), number[k], best, pairing)
+                    and in_view(pose[k], points[point], camera, max_range)
+                ):
                     value = np.float32(quality(eye, points[point], normals[point]))
-                    if value > known[point]:
+                    if may_grow(row, point, value, number[k], best, pairing):
                         if every & ONE:
-                            grown[k] += value - known[point]
-                            known[point] = value
+                            raise_point(row, point, value, number[k], points, normals, best, pairing, grown[k])
                         else:
                             pairs[count, 0], pairs[count, 1], values[count] = k, point, value
                             count += 1
                 some, every, point = some >> ONE, every >> ONE, point + 1
     return grown, pairs[:count], values[:count]
+
+
+@njit(cache=True)
+def raise_points(rows, pairs, values, number, points, normals, best, pairing, grown):
+    """`raise_point` for `(p, 2)` pairs (index of the agent, point) with qualities `values` `(p,)`."""
+    for i in range(len(pairs)):
+        k = pairs[i, 0]
+        raise_point(rows[k], pairs[i, 1], values[i], number[k], points, normals, best, pairing, grown[k])
+
+
+@njit(cache=True)
+def may_grow(row, point, value, number, best, pairing):
+    """Whether a view of this quality could raise Q or S of a point, or help a later one to; see `raise_point`.
+
+    The same eye sees a point equally well each time; no pair with a view is better than the root of its quality, for no
+    quality is above 1.
+    """
+    pair, seen_from, _ = pairing
+    if seen_from.shape[2] == 0:
+        return value > best[row, point]
+    if (seen_from[row, point, number // 64] >> np.uint64(number % 64)) & ONE:
+        return False
+    return value > best[row, point] or value > pair[row, point] * pair[row, point]
+
+
+@njit(cache=True)
+def raise_point(row, point, value, number, points, normals, best, pairing, grown):
+    """Enter that an agent's eye sees a point.
+
+    Args:
+        row: of the agent in `best` and `pairing`.
+        point: which one.
+        value: quality of the view, as single precision.
+        number: of the eye, which stands in `eyes`.
+        points: `(m, 3)` metres.
+        normals: `(m, 3)` unit vectors.
+        best: `(n, m)` Q, greatest quality so far.
+        pairing: `(n, m)` S, the greatest parallax quality so far; `(n, m, words)` bit sets of the eyes that saw the
+            point and could matter; `(n, most, 3)` eyes, metres. Without words, S is not computed.
+        grown: `(2,)` to which the growth of Q and S is added.
+    """
+    if value > best[row, point]:
+        grown[0] += value - best[row, point]
+        best[row, point] = value
+    pair, seen_from, eyes = pairing
+    if seen_from.shape[2] == 0:
+        return
+    before = pair[row, point]
+    square = np.float64(before * before)
+    for word in range(seen_from.shape[2]):
+        bits = seen_from[row, point, word]
+        while bits != 0:
+            other = eyes[row, 64 * word + lowest(bits)]
+            bits &= bits - ONE
+            product = value * quality(other, points[point], normals[point])
+            if product > square:
+                square = max(square, product * parallax_square(eyes[row, number], other, points[point]))
+    seen_from[row, point, number // 64] |= ONE << np.uint64(number % 64)
+    after = np.float32(np.sqrt(square))
+    if after > before:
+        grown[1] += after - before
+        pair[row, point] = after

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.compiled import njit
+from avp_habitat.metrics import PARALLAX_DEG
 from avp_habitat.poses import Intrinsics
 
 Float = NDArray[np.floating]
@@ -18,6 +19,7 @@ Camera = tuple[float, float, float, float, float, float]
 
 FULL_DISTANCE_M = 2.0
 """d₀: a surface seen straight on from this near, or nearer, is seen with quality 1, metres."""
+_FULL_PARALLAX = np.sin(np.radians(PARALLAX_DEG)) ** 2
 
 
 def camera_numbers(intrinsics: Intrinsics) -> Camera:
@@ -58,6 +60,19 @@ def quality(eye, point, normal):
     distance = max(np.sqrt(x * x + y * y + z * z), 1e-9)
     cosine = (x * normal[0] + y * normal[1] + z * normal[2]) / distance
     return min(max(cosine, 0.0), 1.0) * min(1.0, FULL_DISTANCE_M / distance)
+
+
+@njit(cache=True)
+def parallax_square(eye, other, point):
+    """min(1, sin θ / sin 10°)², θ the angle at a point between the rays from two places.
+
+    The error of a depth that is triangulated along two rays grows as 1 / sin θ; 10° counts as enough.
+    """
+    ax, ay, az = eye[0] - point[0], eye[1] - point[1], eye[2] - point[2]
+    bx, by, bz = other[0] - point[0], other[1] - point[1], other[2] - point[2]
+    cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    lengths = (ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz)
+    return min(1.0, (cx * cx + cy * cy + cz * cz) / (max(lengths, 1e-18) * _FULL_PARALLAX))
 
 
 @njit(cache=True)

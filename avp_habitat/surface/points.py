@@ -48,6 +48,8 @@ class SceneSurface:
     """`(m, 3)` metres, world frame."""
     normals: NDArray[np.float64]
     """`(m, 3)` unit vectors out of the surface, to the side from which it was seen."""
+    best: NDArray[np.float64]
+    """`(m,)` quality with which each was seen from the places where the points were looked for: about the best one."""
 
 
 def views_all_over(simulator: Simulator, settings: TaskSettings) -> Iterator[SampledView]:
@@ -81,7 +83,8 @@ def scene_surface(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
     rows = _best(np.concatenate(found))
     if not len(rows):
         raise UsageError(f"reward or observation surface: {simulator.scene} shows none; expected walls or furniture")
-    return SceneSurface(np.ascontiguousarray(rows[:, :3]), np.ascontiguousarray(rows[:, 3:6]))
+    points, normals, (best,) = (np.ascontiguousarray(part) for part in (rows[:, :3], rows[:, 3:6], rows[:, 6:].T))
+    return SceneSurface(points, normals, best)
 
 
 def _normals(view: SampledView, eye: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

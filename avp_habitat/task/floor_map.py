@@ -98,3 +98,46 @@ class MapObserver:
         maps[:, 0] /= per_side**2
         maps[:, 1:] /= per_side
         return np.minimum(maps, 1.0).reshape(len(rows), SIZE)
+
+    def free(
+        self,
+        first_seen: NDArray[np.int16],
+        rows: NDArray[np.integer],
+        position: NDArray[np.floating],
+        yaw: NDArray[np.floating],
+        rays: int,
+        most_m: float,
+    ) -> NDArray[np.float32]:
+        """What k agents know of the way in so many directions to the right, from ahead.
+
+        Returns:
+            `(k, 2, rays)` how far nothing is known to block the way, by `most_m`, up to 1: it is blocked where observed
+            floor ends beside what is not navigable; and the share of that way that is observed floor. The rest is as
+            for `observe`.
+        """
+        found = np.zeros((len(rows), 2, rays), dtype=np.float32)
+        place = (np.asarray(position)[:, [0, 2]] - self._origin) / self._cell_m
+        _free(self._index, first_seen, rows, place, np.asarray(yaw), most_m / self._cell_m, found)
+        return found
+
+
+@njit(cache=True)
+def _free(index, first_seen, rows, place, yaw, most, found):
+    """Follow rays over the floor cell by cell; arguments as of `draw`, lengths in floor cells."""
+    rays = found.shape[2]
+    for k in range(len(rows)):
+        seen = first_seen[rows[k]]
+        for ray in range(rays):
+            heading = yaw[k] - 2 * np.pi * ray / rays
+            x, z, length = -np.sin(heading), -np.cos(heading), 1.0
+            observed, before = 0.0, False
+            while length < most:
+                i, j = int(np.floor(place[k, 1] + length * z)) + 1, int(np.floor(place[k, 0] + length * x)) + 1
+                inside = 0 <= i < index.shape[0] and 0 <= j < index.shape[1] and index[i, j] >= 0
+                if before and not inside:
+                    break
+                before = inside and seen[index[i, j]] != 0
+                observed += before
+                length += 1.0
+            found[k, 0, ray] = min(length, most) / most
+            found[k, 1, ray] = observed / length

@@ -58,10 +58,39 @@ class SceneAgents:
 
     def surface_maps(self) -> NDArray[np.float32]:
         """As `Agents.surface_maps`."""
+        maps = self._known().observe(self._rows, self.views.position, self.views.yaw)
+        return maps.reshape(-1, len(surface_map.CHANNELS), surface_map.SIDE, surface_map.SIDE)
+
+    def surface_around(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """As `surface.around.look_around`."""
+        return self._known().around(self.views, self._rows)
+
+    def surface_shares(self) -> NDArray[np.float64]:
+        """`(k, 2)` ΣQ and ΣS by the sum of the best qualities in the scene, which no robot knows."""
+        return self._known().shares(self._rows)
+
+    def free_floor(self, rays: int, most_m: float) -> NDArray[np.float32]:
+        """As `floor_map.MapObserver.free`."""
+        return self._floor.free(self._first_seen, self._rows, self.views.position, self.views.yaw, rays, most_m)
+
+    def _known(self) -> RoomSurface:
         if self._surface is None:
             raise UsageError("surface_maps: the observation has to declare that by needs_surface = True")
-        maps = self._surface.observe(self._rows, self.views.position, self.views.yaw)
-        return maps.reshape(-1, len(surface_map.CHANNELS), surface_map.SIDE, surface_map.SIDE)
+        return self._surface
+
+
+@dataclass(frozen=True)
+class Trail:
+    """What n agents did so far in their episodes; entries after an agent's step t are not of this episode."""
+
+    path: Float
+    """`(n, T + 1, 3)` the start and the feet after each step, metres."""
+    angles: Float
+    """`(n, T + 1, 2)` yaw and pitch, radians."""
+    gain: Float
+    """`(n, T + 1, 2)` ΣΔQ and ΣΔS of each view, zeros where they are not computed."""
+    action: Float
+    """`(n, T)` the action of each step."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +121,8 @@ class Agents:
     """`(n,)` ‖p − p̄‖ in metres."""
     diameter_m: Float
     """`(n,)` r: diameter of the scene's navigable area, metres."""
+    trail: Callable[[], Trail]
+    """Gives what they did so far."""
     _by_scene: Callable[[], list[SceneAgents]]
 
     @cached_property
@@ -133,7 +164,8 @@ class Agents:
 class Observation(Protocol):
     """A kind of observation; a class is made for each task by `Kind(settings)`.
 
-    An attribute `needs_surface = True` declares that `Agents.surface_maps` is used.
+    An attribute `needs_surface = True` declares that what was seen of the surface is used, `needs_parallax = True` that
+    how well along two rays is too.
     """
 
     space: gymnasium.Space[Any]

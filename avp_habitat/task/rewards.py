@@ -27,8 +27,13 @@ class RewardConstants:
     """α of `proposed`: reward per (newly observed cell)^β."""
     alpha_surface: Amount = 0.0045
     """α of `surface`: reward per (newly seen surface point)^β, each weighted by how well it is seen (`surfaces`)."""
+    alpha_multiview: Amount = 0.009
+    """α_m of `multiview`: reward per (growth of Q and S, by their weights)^β."""
+    single_weight: Annotated[float, Range(0, 1)] = 0.5
+    """w of `multiview`: weight of how well points are seen in one view (Q); 1 - w is that of two views (S)."""
     beta: Annotated[float, Range(0, 1)] = 0.9
-    """β of `proposed` and `surface`, no unit, below 1: much that is new at once counts less than step after step."""
+    """β of `proposed`, `surface` and `multiview`, no unit, below 1: much that is new at once counts less than step
+    after step."""
     visit_decay: Amount = 0.5
     """Weight of earlier visits v in α / (1 + 0.5·v), per visit."""
     spread: Amount = 0.002
@@ -46,13 +51,13 @@ class RewardConstants:
     redundancy_angle_deg: Annotated[float, Range(0, 180)] = 5.0
     """δ in degrees, for yaw and pitch alike: below one turn, so that turning on is never redundant."""
     stop_bonus: Amount = 1.0
-    """B_s: reward of stopping with enough coverage."""
+    """B_s: reward of stopping with enough coverage, or with all of the surface seen well."""
     stop_per_step_left: Amount = 0.01
-    """λ_e: further reward per step of the budget that was not used."""
+    """λ_e: further reward of `proposed` per step of the budget that was not used."""
     early_stop: Amount = 0.02
-    """Cost of choosing stop with too little coverage."""
+    """Cost of choosing stop with too little coverage in `proposed`."""
     stop_coverage: Annotated[float, Range(0, 1)] = 0.85
-    """τ: the coverage from which stop ends the episode, within [0, 1]."""
+    """τ: the coverage from which stop ends the episode in `proposed`, within [0, 1]."""
 
     def __post_init__(self) -> None:
         """Refuse what is outside its range."""
@@ -66,7 +71,7 @@ class StepFacts:
     new_cells: Number
     """Δc: navigable cells first observed by this step's view."""
     new_surface: Number
-    """ΔS: by how much the qualities of the scene's surface points grew by this step's view; 0 where not computed."""
+    """ΣΔQ: by how much the qualities of the scene's surface points grew by this step's view; 0 where not computed."""
     earlier_visits: Number
     """v: earlier views taken from the agent's cell."""
     spread_m: Number
@@ -81,6 +86,12 @@ class StepFacts:
     """C after the step."""
     steps_left: Number
     """T − t after the step."""
+    new_parallax: Number | float = 0.0
+    """ΣΔS: by how much the points' parallax qualities grew by this step's view; 0 where not computed."""
+    surface: Number | float = 0.0
+    """ΣQ after the step by the sum of the best qualities in the scene, within [0, 1]; 0 where not computed."""
+    parallax: Number | float = 0.0
+    """ΣS after the step by the same sum, within [0, 1]; 0 where not computed."""
 
 
 RewardFunction = Callable[[StepFacts, RewardConstants], Mapping[str, Number | float]]
@@ -88,14 +99,35 @@ RewardFunction = Callable[[StepFacts, RewardConstants], Mapping[str, Number | fl
 may leave some out, but not all."""
 
 
-def reward(*, needs_surface: bool = False, stops: bool = False) -> Callable[[plugins.Function], plugins.Function]:
-    """Declare what a `RewardFunction` needs; one without this decorator needs neither.
+def enough_coverage(facts: StepFacts, constants: RewardConstants) -> Bool:
+    """`(n,)` whether C ≥ τ."""
+    return np.asarray(facts.coverage >= constants.stop_coverage)
+
+
+def always(facts: StepFacts, constants: RewardConstants) -> Bool:
+    """`(n,)` True."""
+    return np.ones(len(facts.coverage), dtype=np.bool_)
+
+
+def reward(
+    *,
+    needs_surface: bool = False,
+    needs_parallax: bool = False,
+    stops: bool | Callable[[StepFacts, RewardConstants], Bool] = False,
+) -> Callable[[plugins.Function], plugins.Function]:
+    """Declare what a `RewardFunction` needs; one without this decorator needs nothing.
 
     Args:
-        needs_surface: `StepFacts.new_surface` is computed, which takes time.
-        stops: the action stop ends the episode where C ≥ τ; elsewhere it is "no movement".
+        needs_surface: `StepFacts.new_surface` and `surface` are computed, which takes time.
+        needs_parallax: `StepFacts.new_parallax` and `parallax` too, which takes more.
+        stops: whether there is the action stop; elsewhere it is "no movement". It ends the episode where this function
+            of the step says so; True stands for `enough_coverage`.
     """
-    return plugins.declares(needs_surface=needs_surface, stops=stops)
+    return plugins.declares(
+        needs_surface=needs_surface or needs_parallax,
+        needs_parallax=needs_parallax,
+        stops=enough_coverage if stops is True else stops,
+    )
 
 
 @reward()
@@ -115,18 +147,30 @@ def coverage_redundancy(facts: StepFacts, constants: RewardConstants) -> dict[st
     }
 
 
-@reward(stops=True)
+@reward(stops=enough_coverage)
 def proposed(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
     """Eq. 19–22: sublinear, visit-discounted coverage with dispersion, step cost and a learned stop."""
     new = _discounted(facts.new_cells, constants.alpha_proposed, facts, constants)
-    return {"coverage": new} | _costs_and_stop(facts, constants)
+    success = constants.stop_bonus + constants.stop_per_step_left * facts.steps_left
+    stop = np.where(enough_coverage(facts, constants), success, -constants.early_stop)
+    return {"coverage": new} | _costs(facts, constants) | {"stop": np.where(facts.stop_chosen, stop, 0.0)}
 
 
-@reward(needs_surface=True, stops=True)
+@reward(needs_surface=True, stops=always)
 def surface(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
-    """`proposed` with new surface ΔS in place of new cells Δc."""
+    """`proposed` with new surface ΣΔQ in place of new cells Δc; stop pays for the share of the surface seen well."""
     new = _discounted(facts.new_surface, constants.alpha_surface, facts, constants)
-    return {"surface": new} | _costs_and_stop(facts, constants)
+    return {"surface": new} | _costs(facts, constants) | {"stop": _stop(facts.surface, facts, constants)}
+
+
+@reward(needs_parallax=True, stops=always)
+def multiview(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
+    """`surface` with w·ΣΔQ + (1 − w)·ΣΔS in place of ΣΔQ, and so the share that stop pays for."""
+    w = constants.single_weight
+    grown = w * facts.new_surface + (1 - w) * facts.new_parallax
+    new = _discounted(grown, constants.alpha_multiview, facts, constants)
+    stop = _stop(w * facts.surface + (1 - w) * facts.parallax, facts, constants)
+    return {"multiview": new} | _costs(facts, constants) | {"stop": stop}
 
 
 def _discounted(amount: Number, alpha: float, facts: StepFacts, constants: RewardConstants) -> Number:
@@ -134,17 +178,19 @@ def _discounted(amount: Number, alpha: float, facts: StepFacts, constants: Rewar
     return alpha / (1 + constants.visit_decay * facts.earlier_visits) * np.power(amount, constants.beta)
 
 
-def _costs_and_stop(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
-    """What `proposed` and `surface` share: dispersion, costs and the stop."""
-    success = constants.stop_bonus + constants.stop_per_step_left * facts.steps_left
-    stop = np.where(stops_episode(facts, constants), success, -constants.early_stop)
+def _costs(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
+    """What `proposed`, `surface` and `multiview` share: dispersion and costs."""
     return {
         "spread": _spread(facts, constants),
         "step": np.full(len(facts.coverage), -constants.step),
         "collision": -constants.collision * facts.collided,
         "redundancy": -constants.redundancy * facts.redundant,
-        "stop": np.where(facts.stop_chosen, stop, 0.0),
     }
+
+
+def _stop(share: Number | float, facts: StepFacts, constants: RewardConstants) -> Number:
+    """B_s · share where the episode is ended: going on pays while a view brings more than it costs."""
+    return np.where(facts.stop_chosen, constants.stop_bonus * share, 0.0)
 
 
 def _spread(facts: StepFacts, constants: RewardConstants) -> Number:
@@ -156,6 +202,7 @@ REWARDS: dict[str, RewardFunction] = {
     "coverage_redundancy": coverage_redundancy,
     "proposed": proposed,
     "surface": surface,
+    "multiview": multiview,
 }
 """What is built in, by name."""
 REWARDS_HELP = f"{', '.join(REWARDS)} or MODULE:FUNCTION"
@@ -181,7 +228,12 @@ def find_reward(reward: str | RewardFunction) -> RewardFunction:
 
 def needs_surface(thing: Any) -> bool:
     """Whether a reward's function or an observation declares that it needs what was seen of the surface."""
-    return bool(getattr(thing, "needs_surface", False))
+    return bool(getattr(thing, "needs_surface", False)) or needs_parallax(thing)
+
+
+def needs_parallax(thing: Any) -> bool:
+    """Whether it declares that it needs how well the surface was seen along two rays."""
+    return bool(getattr(thing, "needs_parallax", False))
 
 
 def has_stop(reward: RewardFunction) -> bool:
@@ -189,9 +241,11 @@ def has_stop(reward: RewardFunction) -> bool:
     return bool(getattr(reward, "stops", False))
 
 
-def stops_episode(facts: StepFacts, constants: RewardConstants) -> Bool:
-    """`(n,)` whether stop was chosen with C ≥ τ, which ends the episode."""
-    return facts.stop_chosen & (facts.coverage >= constants.stop_coverage)
+def stops_episode(reward: RewardFunction, facts: StepFacts, constants: RewardConstants) -> Bool:
+    """`(n,)` whether stop was chosen where the reward lets it end the episode."""
+    if not has_stop(reward):
+        return np.zeros(len(facts.coverage), dtype=np.bool_)
+    return facts.stop_chosen & reward.stops(facts, constants)  # type: ignore[attr-defined]
 
 
 def reward_parts(

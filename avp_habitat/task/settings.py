@@ -8,7 +8,7 @@ from avp_habitat.errors import UsageError
 from avp_habitat.metrics import find_metrics
 from avp_habitat.poses import Intrinsics
 from avp_habitat.ranges import Range, hold_ranges
-from avp_habitat.task.rewards import RewardConstants, RewardFunction, find_reward, needs_surface
+from avp_habitat.task.rewards import RewardConstants, RewardFunction, find_reward, needs_parallax, needs_surface
 
 ACTION_NAMES = ("move_forward", "turn_left", "turn_right", "look_up", "look_down", "stop")
 MOVE_FORWARD, TURN_LEFT, TURN_RIGHT, LOOK_UP, LOOK_DOWN, STOP = range(len(ACTION_NAMES))
@@ -16,6 +16,8 @@ OBSERVATIONS = {
     "numbers": "avp_habitat.task.observations:Numbers",
     "map": "avp_habitat.task.observations:Map",
     "surface_map": "avp_habitat.task.observations:SurfaceMap",
+    "onboard": "avp_habitat.task.onboard:Onboard",
+    "privileged": "avp_habitat.task.onboard:Privileged",
 }
 """The kinds that are built in, by name."""
 OBSERVATIONS_HELP = f"{', '.join(OBSERVATIONS)} or MODULE:OBJECT"
@@ -27,8 +29,8 @@ class TaskSettings:
     """Everything about the task but the scene."""
 
     reward: str | RewardFunction = "proposed"
-    """The reward: coverage, coverage_redundancy, proposed, surface, `module:function`, another distribution's, or the
-    function itself (`rewards.RewardFunction`)."""
+    """The reward: coverage, coverage_redundancy, proposed, surface, multiview, `module:function`, another
+    distribution's, or the function itself (`rewards.RewardFunction`)."""
     constants: RewardConstants = field(default_factory=RewardConstants)
     """The rewards' constants."""
     budget: Annotated[int, Range(1, 32767)] = 80
@@ -59,8 +61,9 @@ class TaskSettings:
     """visible: a cell's floor point is seen. over: a camera ray passes over the cell."""
     observation: Any = "numbers"
     """numbers: the twelve of the design. map: these, whether C ≥ τ, and a map of what was seen of the floor around the
-    agent. surface_map: these, and maps of what was seen of walls, furniture and ceiling. Or `module:object`, another
-    distribution's, or the object itself (`observations.Observation`)."""
+    agent. surface_map: these, and maps of what was seen of walls, furniture and ceiling. onboard: what was seen of
+    floor and surface, from where, and nothing that a robot does not know. privileged: that, coverage and the shares of
+    the surface seen. Or `module:object`, another distribution's, or the object itself (`observations.Observation`)."""
     metrics: tuple[Any, ...] = ()
     """Further metrics, of episodes and of rollouts: `module:function`, another distribution's, or the functions
     themselves (`metrics.metric`). Their values stand beside the suite's own wherever these are logged."""
@@ -85,8 +88,16 @@ class TaskSettings:
     @property
     def with_surface(self) -> bool:
         """Whether what was seen of the scene's surface is computed: the reward or the observation needs it."""
-        kind = plugins.find("avp.observations", self.observation, OBSERVATIONS)
-        return needs_surface(find_reward(self.reward)) or needs_surface(kind)
+        return any(map(needs_surface, self._kinds))
+
+    @property
+    def with_parallax(self) -> bool:
+        """Whether how well it was seen along two rays is computed too."""
+        return any(map(needs_parallax, self._kinds))
+
+    @property
+    def _kinds(self) -> tuple[Any, Any]:
+        return find_reward(self.reward), plugins.find("avp.observations", self.observation, OBSERVATIONS)
 
     def facts(self) -> dict[str, Any]:
         """All fields as they are stored as text: objects by their names."""

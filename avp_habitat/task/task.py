@@ -19,7 +19,7 @@ from avp_habitat.task import motion
 from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.cast import CastSensor, TableSensor
 from avp_habitat.task.floor_map import MapObserver
-from avp_habitat.task.observations import Agents, Observed, SceneAgents, make_observation
+from avp_habitat.task.observations import Agents, Observed, SceneAgents, Trail, make_observation
 from avp_habitat.task.rewards import StepFacts, find_reward, has_stop, reward_parts, stops_episode
 from avp_habitat.task.settings import MOVE_FORWARD, STOP, TaskSettings
 from avp_habitat.task.trajectory import Trajectory
@@ -40,7 +40,7 @@ class StepOutcome:
     parts: dict[str, NDArray[np.float64]]
     """`(n,)` each named part of the reward."""
     terminated: NDArray[np.bool_]
-    """`(n,)` stop was chosen with enough coverage."""
+    """`(n,)` stop was chosen, and ended the episode."""
     truncated: NDArray[np.bool_]
     """`(n,)` the budget ran out without such a stop."""
     facts: StepFacts
@@ -91,6 +91,7 @@ class ViewpointTask:
         self._path = np.zeros((agents, settings.budget + 1, 3))
         self._angles = np.zeros((agents, settings.budget + 1, 2))
         self._cell = np.zeros((agents, settings.budget + 1, 2), dtype=np.int64)
+        self._gain = np.zeros((agents, settings.budget + 1, 2))
         self._log: dict[str, NDArray[np.float64]] = defaultdict(partial(np.zeros, (agents, settings.budget)))
         # By the names that the reward gives them, from the first step that has them; zero in all others.
         self._parts: dict[str, NDArray[np.float64]] = defaultdict(partial(np.zeros, (agents, settings.budget)))
@@ -158,10 +159,11 @@ class ViewpointTask:
         self._remember(self._everyone)
         seen = self._shown(self._everyone, self._capture)
         self._observed += seen.new_cells
-        facts = self._facts(actions, seen.new_cells, self._capture_surface())
+        self._capture_surface()
+        facts = self._facts(actions, seen.new_cells)
         parts = reward_parts(self._reward, facts, self.settings.constants)
         reward = np.sum(list(parts.values()), axis=0) + np.zeros(self.agents)
-        terminated = stops_episode(facts, self.settings.constants)
+        terminated = stops_episode(self._reward, facts, self.settings.constants)
         self._record(actions, reward, parts, facts)
         return StepOutcome(
             observation=self._observe(self._everyone, seen, facts.spread_m),
@@ -255,24 +257,30 @@ class ViewpointTask:
     def _capture(self, room: _Room, rows: Rows) -> Shown:
         return room.sensor.capture(self._views(rows), self._first_seen, rows, self.steps[rows])
 
-    def _capture_surface(self) -> NDArray[np.float64]:
-        """`(n,)` ΔS of the newest views; zeros where nothing needs it."""
-        gain = np.zeros(self.agents)
+    def _capture_surface(self) -> None:
+        """Enter ΣΔQ and ΣΔS of the newest views into the log; zeros where nothing needs them."""
         for room in self._rooms:
             if room.surface is not None:
-                gain[room.rows] = room.surface.capture(self._views(room.rows), room.rows)
-        return gain
+                gain = room.surface.capture(self._views(room.rows), room.rows)
+                self._gain[room.rows, self.steps[room.rows]] = gain
 
-    def _facts(self, actions: NDArray[np.integer], new_cells: NDArray[np.integer], new_surface: Float) -> StepFacts:
+    def _facts(self, actions: NDArray[np.integer], new_cells: NDArray[np.integer]) -> StepFacts:
         past = motion.history(self._path, self._angles, self._cell, self.steps, self.settings.constants)
+        gain, shares = self._gain[self._everyone, self.steps], np.zeros((self.agents, 2))
+        for room in self._rooms:
+            if room.surface is not None:
+                shares[room.rows] = room.surface.shares(room.rows)
         return StepFacts(
             new_cells=new_cells,
-            new_surface=new_surface,
+            new_surface=gain[:, 0],
             **past._asdict(),
             collided=self._collided,
             stop_chosen=(actions == STOP) & has_stop(self._reward),
             coverage=self.coverage,
             steps_left=self.settings.budget - self.steps,
+            new_parallax=gain[:, 1],
+            surface=shares[:, 0],
+            parallax=shares[:, 1],
         )
 
     def _observe(self, rows: Rows, seen: Shown, spread_m: NDArray[np.number]) -> Observed:
@@ -289,9 +297,13 @@ class ViewpointTask:
             collided=self._collided[rows],
             spread_m=np.asarray(spread_m, dtype=np.float64),
             diameter_m=self._diameter[rows],
+            trail=partial(self._trail, rows),
             _by_scene=partial(self._scenes, rows),
         )
         return self.kind(agents)
+
+    def _trail(self, rows: Rows) -> Trail:
+        return Trail(self._path[rows], self._angles[rows], self._gain[rows], self._log["action"][rows])
 
     def _scenes(self, rows: Rows) -> list[SceneAgents]:
         scenes = []
