@@ -226,7 +226,7 @@ def test_points_that_were_not_seen_do_not_enter_the_map():
     surface = scene_surface(SIMULATOR, SETTINGS)
     seen = surface.points[:, 0] < 2.0
     quality = np.where(seen, 0.5, 0.0).astype(np.float32)[None]
-    part = SceneSurface(surface.points[seen], surface.normals[seen])
+    part = SceneSurface(surface.points[seen], surface.normals[seen], surface.best[seen])
     here = (np.array([0]), np.array([[1.5, 0.0, 1.5]]), np.array([0.3]))
     drawn = SurfaceMapper(surface, 1.5).observe(quality, *here)
     assert drawn.sum() > 0

@@ -76,11 +76,7 @@ def new_surface(visible, slots, pose, points, normals, camera, max_range, rows, 
             every = a[word] & b[word] & c[word] & d[word]
             point = 64 * word
             while some != 0:
-                if (
-                    some & ONE
-                    and may_grow(row, point, np.float32(1.0), number[k], best, pairing)
-                    and in_view(pose[k], points[point], camera, max_range)
-                ):
+                if some & ONE and in_view(pose[k], points[point], camera, max_range):
                     value = np.float32(quality(eye, points[point], normals[point]))
                     if may_grow(row, point, value, number[k], best, pairing):
                         if every & ONE:

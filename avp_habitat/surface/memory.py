@@ -5,10 +5,10 @@ import hashlib
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.sight.bits import words_for
+from avp_habitat.sight.bits import pack, words_for
 from avp_habitat.sight.lattice import PlaceTable
 from avp_habitat.sight.newly_seen import new_surface, raise_points
-from avp_habitat.sight.rules import camera_numbers, candidates, view_quality
+from avp_habitat.sight.rules import camera_numbers
 from avp_habitat.sight.tables import SPACING_M, once_per_simulator, point_table, single_rays
 from avp_habitat.simulators.base import Simulator, SingleRays
 from avp_habitat.surface.around import look_around
@@ -58,6 +58,8 @@ class RoomSurface:
         self._pair = np.zeros(shape if settings.with_parallax else (len(rows), 0), dtype=np.float32)
         self._seen_from = np.zeros((*shape, words if settings.with_parallax else 0), dtype=np.uint64)
         self._reached = np.zeros((len(rows), 2))
+        # Places that differ on every point, for who has no tables.
+        self._unsure = np.array([0, 1, 1, 1], np.int32), pack(np.arange(2)[:, None] == np.ones(shape[1]))
 
     def reset(self, rows: Rows) -> None:
         """Forget what some agents saw."""
@@ -71,7 +73,7 @@ class RoomSurface:
         moved = (self._eye[rows] < 0) | (self._eyes[rows, self._eye[rows]] != eyes).any(axis=1)
         self._eye[rows] += moved
         self._eyes[rows, self._eye[rows]] = eyes
-        gain = self._cast(views, rows) if self._rays is None else self._look_up(self._rays, views, rows)
+        gain = self._capture(views, rows)
         self._reached[rows] += gain
         return gain
 
@@ -101,33 +103,28 @@ class RoomSurface:
     def _pairing(self) -> tuple[NDArray, NDArray, NDArray]:
         return self._pair, self._seen_from, self._eyes
 
-    def _cast(self, views: Views, rows: Rows) -> NDArray[np.float64]:
-        """The definition itself: a ray to every point inside the image that the view could show better than before."""
-        settings, surface, pose = self._settings, self._surface, views.camera_to_world
-        found = view_quality(pose[:, :3, 3], surface.points, surface.normals).astype(np.float32)
-        better, reach_m = found > self._quality[rows], settings.max_range_m
-        if settings.with_parallax:
-            better |= found > self._pair[rows] ** 2
-        pairs = candidates(pose, settings.intrinsics, surface.points, better, max_range_m=reach_m)
-        tolerance_m = settings.tolerance_m
-        reached = self._simulator.visible(pose, settings.intrinsics, surface.points, pairs, tolerance_m=tolerance_m)
-        gain, pairs = np.zeros((len(rows), 2)), pairs[reached]
-        self._raise(rows, pairs, found[pairs[:, 0], pairs[:, 1]], gain)
-        return gain
+    def _capture(self, views: Views, rows: Rows) -> NDArray[np.float64]:
+        """Rays to the points that a view could show better than before, as the definition says, or tables of them.
 
-    def _look_up(self, rays: SingleRays, views: Views, rows: Rows) -> NDArray[np.float64]:
-        """Points on which the tables' places differ are cast as rays, the others looked up."""
+        Of what tables tell, only points on which their places differ are cast as rays.
+        """
         points, normals, pose = self._surface.points, self._surface.normals, views.camera_to_world
-        tables = surface_tables(rays, self._settings)
-        slots, visible = tables.around(views.position)[0], tables.columns["visible"]
+        if self._rays is None:
+            slots, visible = self._unsure
+        else:
+            tables = surface_tables(self._rays, self._settings)
+            slots, visible = tables.around(views.position)[0], tables.columns["visible"]
         reach_m, camera, number = self._settings.max_range_m, self._camera, self._eye[rows]
         known = self._quality, self._pairing, number
+        slots = np.broadcast_to(slots, (len(rows), 4))
         gain, pairs, value = new_surface(visible, slots, pose, points, normals, camera, reach_m, rows, *known)
         if len(pairs):
-            reached = rays.reached(pose[:, :3, 3], points, pairs, tolerance_m=self._settings.tolerance_m)
-            self._raise(rows, pairs[reached], value[reached], gain)
+            tolerance_m = self._settings.tolerance_m
+            if self._rays is None:
+                reached = self._simulator.visible(
+                    pose, self._settings.intrinsics, points, pairs, tolerance_m=tolerance_m
+                )
+            else:
+                reached = self._rays.reached(pose[:, :3, 3], points, pairs, tolerance_m=tolerance_m)
+            raise_points(rows, pairs[reached], value[reached], number, points, normals, *known[:2], gain)
         return gain
-
-    def _raise(self, rows: Rows, pairs: Rows, value: NDArray[np.float32], gain: Float) -> None:
-        surface, number = self._surface, self._eye[rows]
-        raise_points(rows, pairs, value, number, surface.points, surface.normals, self._quality, self._pairing, gain)

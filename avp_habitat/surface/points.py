@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from avp_habitat.compiled import njit
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics, unproject
-from avp_habitat.sight.rules import view_quality
+from avp_habitat.sight.rules import quality
 from avp_habitat.sight.tables import once_per_simulator
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.task.motion import sensor_poses
@@ -76,10 +77,7 @@ def scene_surface(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
     """
     found: list[NDArray[np.float64]] = [np.zeros((0, 7))]
     for view in views_all_over(simulator, settings):
-        eye = view.camera_to_world[:3, 3]
-        normals, flat = _normals(view, eye)
-        points, normals = view.points[flat], normals[flat]
-        found.append(_best(np.column_stack([points, normals, view_quality(eye[None], points, normals)[0]])))
+        found.append(_best(_flat_pixels(view.points, view.hit, view.camera_to_world[:3, 3].copy())))
     rows = _best(np.concatenate(found))
     if not len(rows):
         raise UsageError(f"reward or observation surface: {simulator.scene} shows none; expected walls or furniture")
@@ -87,22 +85,40 @@ def scene_surface(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
     return SceneSurface(points, normals, best)
 
 
-def _normals(view: SampledView, eye: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """`(height, width, 3)` unit normals towards the camera, and where the surface is flat enough to have one."""
-    points, middle = view.points, view.points[1:-1, 1:-1]
-    neighbours = (points[1:-1, 2:], points[1:-1, :-2], points[2:, 1:-1], points[:-2, 1:-1])
-    cross = np.cross(neighbours[0] - neighbours[1], neighbours[2] - neighbours[3])
-    normal = cross / np.maximum(np.linalg.norm(cross, axis=-1, keepdims=True), 1e-12)
-    towards = eye - middle
-    normal *= np.where((normal * towards).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
-    off = np.max([np.abs((normal * (other - middle)).sum(axis=-1)) for other in neighbours], axis=0)
-    depth = np.linalg.norm(towards, axis=-1)
-    hit = view.hit
-    inside = hit[1:-1, 1:-1] & hit[1:-1, 2:] & hit[1:-1, :-2] & hit[2:, 1:-1] & hit[:-2, 1:-1]
-    normals, flat = np.zeros_like(points), np.zeros(hit.shape, dtype=np.bool_)
-    normals[1:-1, 1:-1] = normal
-    flat[1:-1, 1:-1] = inside & (off <= _FLAT_SHARE * depth)
-    return normals, flat
+@njit(cache=True)
+def _flat_pixels(points, hit, eye):
+    """Where the surface is flat enough to have a normal: `(k, 7)` points, unit normals towards the eye, qualities.
+
+    `points` `(height, width, 3)` and `hit` `(height, width)` are those of a `SampledView`, the eye is `(3,)` metres.
+    """
+    found, count = np.empty((hit.size, 7)), 0
+    for i in range(1, hit.shape[0] - 1):
+        for j in range(1, hit.shape[1] - 1):
+            if not (hit[i, j] and hit[i, j + 1] and hit[i, j - 1] and hit[i + 1, j] and hit[i - 1, j]):
+                continue
+            ax, ay, az = _difference(points[i, j + 1], points[i, j - 1])
+            bx, by, bz = _difference(points[i + 1, j], points[i - 1, j])
+            nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+            length = max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-12)
+            tx, ty, tz = _difference(eye, points[i, j])
+            if nx * tx + ny * ty + nz * tz < 0:
+                length = -length
+            nx, ny, nz = nx / length, ny / length, nz / length
+            off = 0.0
+            for di, dj in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+                x, y, z = _difference(points[i + di, j + dj], points[i, j])
+                off = max(off, abs(nx * x + ny * y + nz * z))
+            if off <= _FLAT_SHARE * np.sqrt(tx * tx + ty * ty + tz * tz):
+                row = found[count]
+                row[:3], row[3], row[4], row[5] = points[i, j], nx, ny, nz
+                row[6] = quality(eye, points[i, j], row[3:6])
+                count += 1
+    return found[:count]
+
+
+@njit(cache=True)
+def _difference(a, b):
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 def _best(rows: NDArray[np.float64]) -> NDArray[np.float64]:

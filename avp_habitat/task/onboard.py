@@ -123,7 +123,7 @@ def _gains(trail: Trail, steps: NDArray[np.int64]) -> NDArray[np.floating]:
 
 def _last_action(trail: Trail, steps: NDArray[np.int64]) -> NDArray[np.floating]:
     last = trail.action[np.arange(len(steps)), np.maximum(steps - 1, 0)]
-    return (np.arange(len(ACTION_NAMES)) == last[:, None]) & (steps > 0)[:, None]
+    return np.equal(np.arange(len(ACTION_NAMES)), last[:, None]) * (steps > 0)[:, None] * 1.0
 
 
 @njit(cache=True)
