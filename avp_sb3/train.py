@@ -23,7 +23,10 @@ from avp_habitat.task.rewards import REWARDS_HELP
 from avp_habitat.task.settings import OBSERVATIONS_HELP, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
 from avp_sb3.presets import MAP, PRESETS, PPOPreset
+from avp_sb3.vec_env.pool import TURNOVER, describe
 
+FIRST_SEED, _ROOMS_END = 1000, 100_000
+"""Of the generated rooms and homes to train in; those from 100,000 on are for tests."""
 _MLFLOW = "runs:/"
 _MOST = 1e12
 
@@ -35,7 +38,15 @@ class Train:
     300,000 steps of 64 agents take about a minute on two CPU cores with the numbers.
     """
 
-    scene: Annotated[tuple[str, ...], arg(help=f"{SCENES}; agents share several")] = ("builtin:0",)
+    scene: Annotated[tuple[str, ...], arg(help=f"{SCENES}; agents share several (omitted: builtin:0)")] = ()
+    rooms: Annotated[int, Range(0, _ROOMS_END - FIRST_SEED)] = 0
+    """So many generated rooms, builtin:1000, builtin:1001, …, beside the scenes."""
+    homes: Annotated[int, Range(0, _ROOMS_END - FIRST_SEED)] = 0
+    """So many generated homes, builtin-home:1000, builtin-home:1001, …, beside the scenes."""
+    open_scenes: Annotated[int, Range(1, _MOST)] = 8
+    """With rooms or homes: so many scenes are open at a time, over all workers."""
+    turnover: Annotated[int, Range(1, _MOST)] = TURNOVER
+    """With rooms or homes: a scene is held for the steps of so many whole episodes."""
     reward: Annotated[str, arg(help=REWARDS_HELP)] = "proposed"
     observation: Annotated[str, arg(help=f"{OBSERVATIONS_HELP}; also chooses PPO's settings")] = "numbers"
     metrics: Annotated[tuple[str, ...], arg(help=METRICS_HELP)] = ()
@@ -44,7 +55,7 @@ class Train:
     agents: int | None = None
     """Agents stepped as one batch (omitted: the settings' own)."""
     workers: int | None = None
-    """Processes with a simulator each, a multiple of the scenes' number."""
+    """Processes with simulators of their own: with rooms or homes any number, else a multiple of the scenes'."""
     simulator: SimulatorChoice = field(default_factory=SimulatorChoice)
     """Which simulator opens the scenes."""
     rays: bool = False
@@ -76,6 +87,13 @@ class Train:
         _ = self.settings, self.preset
 
     @property
+    def scenes(self) -> list[str]:
+        """All that were asked for."""
+        seeds = {"builtin": self.rooms, "builtin-home": self.homes}
+        made = [f"{kind}:{FIRST_SEED + number}" for kind, count in seeds.items() for number in range(count)]
+        return [*self.scene, *made] or ["builtin:0"]
+
+    @property
     def preset(self) -> PPOPreset:
         """PPO's settings; the buffer is shared by as many agents as asked for."""
         preset = PRESETS.get(self.observation, MAP)
@@ -104,8 +122,10 @@ def _environment(options: Train) -> Any:
 
     from avp_sb3 import AVPSubprocVecEnv, AVPVecEnv
 
-    choice, scenes = options.simulator, list(options.scene)
+    choice, scenes = options.simulator, options.scenes
     common = {"agents": options.preset.n_envs, "settings": options.settings, "seed": options.seed, **vars(choice)}
+    if options.rooms or options.homes:
+        common |= {"open_scenes": options.open_scenes, "turnover": options.turnover}
     if options.workers is None and (len(scenes) == 1 or not choice.one_per_process):
         return VecMonitor(AVPVecEnv(scenes, **common))
     return VecMonitor(AVPSubprocVecEnv(scenes, workers=options.workers, **common))
@@ -180,7 +200,7 @@ def _callbacks(options: Train, tracking: Any) -> list[Any]:
 def main(options: Train) -> None:
     """Train, track and save."""
     check_writable(options.out)
-    print(f"opening {', '.join(options.scene)} …", flush=True)
+    print(f"opening {describe(options.scenes)} …", flush=True)
 
     # Late, so that --help and a mistyped option answer at once.
     import torch

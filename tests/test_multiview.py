@@ -113,7 +113,7 @@ def test_what_a_robot_does_not_know_changes_nothing(corridor):
 def _shown(task):
     rows = np.array([0])
     shown = task._shown(rows, lambda room, there: room.sensor.look(task._views(there)))
-    return shown, task._facts(np.array([0]), shown.new_cells).spread_m
+    return shown, task._facts(np.array([0]), shown.new_cells, np.zeros((1, 2))).spread_m
 
 
 def test_a_robots_parts_say_what_they_are_called(corridor):

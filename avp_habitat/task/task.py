@@ -55,7 +55,6 @@ class _Room:
     sensor: CastSensor | TableSensor
     floor: MapObserver
     surface: RoomSurface | None
-    rows: Rows
 
 
 class ViewpointTask:
@@ -76,15 +75,18 @@ class ViewpointTask:
         self.kind = make_observation(settings)
         """The kind of observation; its `space` is of one agent."""
         self._everyone = np.arange(agents)
-        self._room_of = self._everyone % len(scenes)
-        self._rooms = [self._room(scene, index) for index, scene in enumerate(scenes[:agents])]
-        areas = [self._rooms[index].simulator.area for index in self._room_of]
-        self._cells = np.array([len(area.centres) for area in areas])
-        self._diameter = np.array([area.diameter_m for area in areas])
+        # By number; `_room_of` holds each agent's.
+        self._rooms: dict[int, _Room] = {}
+        self._room_of = np.full(agents, -1)
+        self._cells = np.zeros(agents, dtype=np.int64)
+        self._diameter = np.zeros(agents)
         self.steps = np.zeros(agents, dtype=np.int64)
         self.position = np.zeros((agents, 3))
         self.yaw, self.pitch = np.zeros((2, agents))
-        self._first_seen = np.zeros((agents, self._cells.max()), dtype=np.int16)
+        self._first_seen = np.zeros((agents, 0), dtype=np.int16)
+        for index, scene in enumerate(scenes[:agents]):
+            rows = self._everyone[index :: len(scenes)]
+            self.enter(rows, self.add_scene(scene, rows))
         self._observed = np.zeros(agents, dtype=np.int64)
         self._collided = np.zeros(agents, dtype=np.bool_)
         # Row 0 is the start, row t the state after step t.
@@ -96,11 +98,37 @@ class ViewpointTask:
         # By the names that the reward gives them, from the first step that has them; zero in all others.
         self._parts: dict[str, NDArray[np.float64]] = defaultdict(partial(np.zeros, (agents, settings.budget)))
 
-    def _room(self, scene: Simulator, index: int) -> _Room:
-        settings, rows = self.settings, np.flatnonzero(self._room_of == index)
-        sensor = TableSensor(scene, settings) if settings.lookup else CastSensor(scene, settings)
-        surface = RoomSurface(scene, settings, self.agents, rows) if settings.with_surface else None
-        return _Room(scene, sensor, MapObserver(scene.area), surface, rows)
+    def add_scene(self, simulator: Simulator, rows: Rows) -> int:
+        """Make a scene ready for some agents, `(k,)`, and give it the number by which they `enter` it.
+
+        Raises:
+            UsageError: the settings ask for what the simulator cannot do.
+        """
+        settings, wider = self.settings, len(simulator.area.centres) - self._first_seen.shape[1]
+        sensor = TableSensor(simulator, settings) if settings.lookup else CastSensor(simulator, settings)
+        surface = RoomSurface(simulator, settings, self.agents, rows) if settings.with_surface else None
+        number = max(self._rooms, default=-1) + 1
+        self._rooms[number] = _Room(simulator, sensor, MapObserver(simulator.area), surface)
+        if wider > 0:
+            self._first_seen = np.pad(self._first_seen, ((0, 0), (0, wider)))
+        return number
+
+    def enter(self, rows: Rows, number: int) -> None:
+        """Take some agents, of those for whom it was added, to another scene; `reset` must place them there.
+
+        A scene that its last agent leaves is forgotten.
+        """
+        left = set(self._room_of[rows].tolist())
+        area = self._rooms[number].simulator.area
+        self._room_of[rows], self._cells[rows], self._diameter[rows] = number, len(area.centres), area.diameter_m
+        for empty in left.difference(self._room_of.tolist()):
+            self._rooms.pop(empty, None)
+        self._all_rooms = self._grouped(self._everyone)
+
+    @property
+    def simulators(self) -> list[Simulator]:
+        """Those of all scenes, in the order in which they were added."""
+        return [room.simulator for room in self._rooms.values()]
 
     def simulator(self, row: int) -> Simulator:
         """The simulator of one agent's scene."""
@@ -159,8 +187,7 @@ class ViewpointTask:
         self._remember(self._everyone)
         seen = self._shown(self._everyone, self._capture)
         self._observed += seen.new_cells
-        self._capture_surface()
-        facts = self._facts(actions, seen.new_cells)
+        facts = self._facts(actions, seen.new_cells, self._capture_surface())
         parts = reward_parts(self._reward, facts, self.settings.constants)
         reward = np.sum(list(parts.values()), axis=0) + np.zeros(self.agents)
         terminated = stops_episode(self._reward, facts, self.settings.constants)
@@ -213,10 +240,11 @@ class ViewpointTask:
 
     def _by_room(self, rows: Rows) -> list[tuple[_Room, NDArray[np.integer]]]:
         """The rooms of some agents, and which of those agents are in each."""
-        if len(self._rooms) == 1:
-            return [(self._rooms[0], np.arange(len(rows)))]
+        return self._all_rooms if rows is self._everyone else self._grouped(rows)
+
+    def _grouped(self, rows: Rows) -> list[tuple[_Room, NDArray[np.integer]]]:
         rooms = self._room_of[rows]
-        return [(self._rooms[index], np.flatnonzero(rooms == index)) for index in np.unique(rooms)]
+        return [(self._rooms[index], np.flatnonzero(rooms == index)) for index in np.unique(rooms) if index >= 0]
 
     def _views(self, rows: Rows) -> Views:
         position, yaw, pitch = self.position[rows], self.yaw[rows], self.pitch[rows]
@@ -246,7 +274,7 @@ class ViewpointTask:
     def _shown(self, rows: Rows, sense: Callable[[_Room, Rows], Shown]) -> Shown:
         """What the newest views of some agents show, as `sense` finds it for those in one room."""
         if len(self._rooms) == 1:
-            return sense(self._rooms[0], rows)
+            return sense(*self._rooms.values(), rows)
         least, mean = np.empty((2, len(rows)))
         whole = Shown(least, mean, np.empty(len(rows), dtype=np.int64))
         for room, chosen in self._by_room(rows):
@@ -257,19 +285,18 @@ class ViewpointTask:
     def _capture(self, room: _Room, rows: Rows) -> Shown:
         return room.sensor.capture(self._views(rows), self._first_seen, rows, self.steps[rows])
 
-    def _capture_surface(self) -> None:
-        """Enter ΣΔQ and ΣΔS of the newest views into the log; zeros where nothing needs them."""
-        for room in self._rooms:
+    def _capture_surface(self) -> NDArray[np.float64]:
+        """Enter ΣΔQ and ΣΔS of the newest views into the log, give the shares reached; zeros for nothing."""
+        shares = np.zeros((self.agents, 2))
+        for room, rows in self._by_room(self._everyone):
             if room.surface is not None:
-                gain = room.surface.capture(self._views(room.rows), room.rows)
-                self._gain[room.rows, self.steps[room.rows]] = gain
+                self._gain[rows, self.steps[rows]] = room.surface.capture(self._views(rows), rows)
+                shares[rows] = room.surface.shares(rows)
+        return shares
 
-    def _facts(self, actions: NDArray[np.integer], new_cells: NDArray[np.integer]) -> StepFacts:
+    def _facts(self, actions: NDArray[np.integer], new_cells: NDArray[np.integer], shares: Float) -> StepFacts:
         past = motion.history(self._path, self._angles, self._cell, self.steps, self.settings.constants)
-        gain, shares = self._gain[self._everyone, self.steps], np.zeros((self.agents, 2))
-        for room in self._rooms:
-            if room.surface is not None:
-                shares[room.rows] = room.surface.shares(room.rows)
+        gain = self._gain[self._everyone, self.steps]
         return StepFacts(
             new_cells=new_cells,
             new_surface=gain[:, 0],

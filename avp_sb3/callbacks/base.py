@@ -46,6 +46,21 @@ def settings_of(env: VecEnv) -> TaskSettings | None:
     return found if isinstance(found, TaskSettings) else None
 
 
+def pool_of(env: VecEnv) -> str | None:
+    """What the scenes of a pool are called; None where all are open all the time."""
+    return env.get_attr("pool", 0)[0] if env.has_attr("pool") else None
+
+
+def scenes_told(env: VecEnv) -> list[str]:
+    """The names of the scenes that are open all the time, or what those of a pool are called together."""
+    return each_once(env, "scene_name") if (pool := pool_of(env)) is None else [pool]
+
+
+def each_once(env: VecEnv, attribute: str) -> list[str]:
+    """The values of an attribute over the environments; none where they have no such attribute."""
+    return list(dict.fromkeys(map(str, env.get_attr(attribute)))) if env.has_attr(attribute) else []
+
+
 def is_learning(model: Any) -> bool:
     """Whether `model.learn` is among the callers, which says that a training came to its own end.
 

@@ -29,7 +29,15 @@ from avp_habitat.tracking.deliver import recover_in_background
 from avp_habitat.tracking.names import CONTINUED_TAG, KIND_TAG, RESUMED_TAG
 from avp_habitat.tracking.run import NewRun, Status, TrackedRun, continue_run, join_run, may_continue, start_run
 from avp_habitat.tracking.stores import DEFAULT_ADDRESS, about_run, shown
-from avp_sb3.callbacks.base import LoggedFile, finished_episodes, is_learning, settings_of
+from avp_sb3.callbacks.base import (
+    LoggedFile,
+    each_once,
+    finished_episodes,
+    is_learning,
+    pool_of,
+    scenes_told,
+    settings_of,
+)
 
 FORMAT = "mlflow"
 """The name by which `logger.record(..., exclude="mlflow")` keeps a value away from MLflow."""
@@ -250,7 +258,9 @@ class MLflowCallback(BaseCallback):
     def _log_facts(self, run: TrackedRun, earlier: str | None) -> None:
         env = self.training_env
         params = hyperparameters(self.model) | _task_facts(env) | flat(self._params)
-        scenes = {"avp.scene": _each_once(env, "scene_name"), "avp.scene_digest": _each_once(env, "scene_digest")}
+        scenes = {"avp.scene": scenes_told(env)}
+        if pool_of(env) is None:
+            scenes["avp.scene_digest"] = each_once(env, "scene_digest")
         tags = {KIND_TAG: "training"} | {tag: ", ".join(values) for tag, values in scenes.items() if values}
         steps = self.model.num_timesteps
         if earlier is not None and earlier != run.run_id:
@@ -316,16 +326,11 @@ def run_name(model: BaseAlgorithm, env: VecEnv) -> str:
 
     MLflow would draw a name at random, the same one after each training with the same seed.
     """
-    task, scenes = _task_facts(env), _each_once(env, "scene_name")
+    task, scenes = _task_facts(env), scenes_told(env)
     words = [type(model).__name__.lower(), task.get("env.reward"), scenes[0] if scenes else task.get("env.id")]
     words += [f"and {len(scenes) - 1} more"] if len(scenes) > 1 else []
     words += [] if model.seed is None else [f"seed {model.seed}"]
     return " ".join(str(word) for word in words if word is not None)
-
-
-def _each_once(env: VecEnv, attribute: str) -> list[str]:
-    """The values of an attribute over the environments; none where they have no such attribute."""
-    return list(dict.fromkeys(map(str, env.get_attr(attribute)))) if env.has_attr(attribute) else []
 
 
 def _plain(value: Any) -> Any:

@@ -1,6 +1,6 @@
 """Many agents in one or more scenes as one Stable-Baselines3 `VecEnv`: one task, and one call for all their views."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from avp_habitat.task.env import step_info
 from avp_habitat.task.observations import Observed, action_space, each
 from avp_habitat.task.settings import TaskSettings
 from avp_habitat.task.task import ViewpointTask
+from avp_sb3.vec_env.pool import TURNOVER, ScenePool
 
 Scenes = str | Path | Sequence[str | Path]
 """One, or several that agents take in turn."""
@@ -41,40 +42,67 @@ class AVPVecEnv(VecEnv):
         up: str | None = None,
         settings: TaskSettings | None = None,
         seed: int | None = None,
+        open_scenes: int | None = None,
+        turnover: int = TURNOVER,
     ) -> None:
         """Open the scenes for n agents.
 
         Args:
             scene: as `scenes.location.locate` takes it, or several; agent i walks in scene i modulo their number.
-            agents: n, at least 1, and at least one for each scene.
+            agents: n, at least 1, and at least one for each open scene.
             simulator: a simulator's name or factory, or those that are open already, one for each scene.
             gpu: the CUDA device of `habitat`; -1 for none, None for the first one there is.
             navmesh: file of the only scene's NavMesh; computed when omitted.
             up: axis of mesh files that points up, `y` or `z`; of each file what is known of it when omitted.
             settings: of the task; when omitted, the defaults, looked up where the simulator casts rays.
-            seed: of the starts; agent i uses `seed + i`, as SB3 seeds separate environments.
+            seed: of the starts; agent i uses `seed + i`, as SB3 seeds separate environments. Also of a pool's order.
+            open_scenes: so many of the scenes, which are then a pool, are open at a time; all of them when omitted.
+                They are changed one after the other, and agent i walks in the open scene i modulo `open_scenes`. No
+                episode is cut: an agent enters the new scene when it begins its next episode, the old one is closed
+                when its last agent has left, and each scene of the pool comes once before any comes again.
+            turnover: a scene of a pool is held for the steps of so many whole episodes, at least 1.
 
         Raises:
-            UsageError: too few agents, or an unknown name.
+            UsageError: too few agents, an unknown name, or a pool of simulators that are open already.
             SceneError: a scene cannot be used; the text names it.
             SimulatorError: the simulator cannot run here, or several scenes need a process each (`AVPSubprocVecEnv`).
         """
-        self.simulators = _open(scene, simulator, gpu=gpu, navmesh=navmesh, up=up)
-        casts = all(isinstance(opened, SingleRays) for opened in self.simulators)
+        number("turnover", turnover, int, Range(1, 1e12))
+        self._pool, opened = _open(scene, simulator, open_scenes, seed, gpu=gpu, navmesh=navmesh, up=up)
+        casts = all(isinstance(each, SingleRays) for each in opened)
         self.settings = settings or TaskSettings(lookup=casts)
         agents = number("agents", agents, int, Range(0, 1e12))
-        if agents < len(self.simulators):
-            raise UsageError(f"agents: expected at least {len(self.simulators)}, one for each scene, got {agents}")
+        if agents < len(opened):
+            raise UsageError(f"agents: expected at least {len(opened)}, one for each scene, got {agents}")
+        self._open_scenes, self._stepped = len(opened), 0
+        # Rounded up: all agents have entered a scene before the next one is opened for them.
+        self._change_every = -(-turnover * self.settings.budget // self._open_scenes)
+        self._next = np.full(agents, -1)
+        self._left: dict[int, Simulator] = {}
         self.render_mode = None
-        self._task = ViewpointTask(self.simulators, self.settings, agents)
+        self._task = ViewpointTask(opened, self.settings, agents)
         super().__init__(agents, self._task.kind.space, action_space())
         self._generators = [np.random.default_rng() for _ in range(agents)]
         self._actions = np.zeros(agents, dtype=np.int64)
         self.seed(seed)
 
+    @property
+    def simulators(self) -> list[Simulator]:
+        """Those that are open, each once."""
+        return self._task.simulators
+
+    @property
+    def pool(self) -> str | None:
+        """What the scenes of a pool are called together; None where all scenes are open all the time."""
+        return None if self._pool is None else self._pool.name
+
+    def simulator_of(self, row: int) -> Simulator:
+        """The simulator of an agent's scene; when an episode has just ended, of the scene in which it was."""
+        return self._left.get(row) or self._task.simulator(row)
+
     def capture(self, row: int, camera_to_world: NDArray[np.floating], intrinsics: Intrinsics) -> Frames:
         """Pictures and depth of `(k, 4, 4)` habitat poses in an agent's scene, without any effect on the episodes."""
-        return pictures(self._task.simulator(row), camera_to_world, intrinsics)
+        return pictures(self.simulator_of(row), camera_to_world, intrinsics)
 
     def reset(self) -> Observed:  # type: ignore[override]
         """Start all episodes at random; the first axis of what is observed is n."""
@@ -96,6 +124,8 @@ class AVPVecEnv(VecEnv):
 
     def step_wait(self) -> tuple[Observed, NDArray, NDArray, list[dict[str, Any]]]:  # type: ignore[override]
         """Step all agents; those whose episode ended start the next one, as SB3 expects."""
+        self._left.clear()
+        self._change_scene()
         outcome = self._task.step(self._actions)
         done = outcome.terminated | outcome.truncated
         infos = step_info(self._task, outcome)
@@ -105,6 +135,7 @@ class AVPVecEnv(VecEnv):
             infos[row]["terminal_observation"] = each(lambda values, row=row: values[row].copy(), observation)
             infos[row]["TimeLimit.truncated"] = bool(outcome.truncated[row])
         if len(ended):
+            self._enter_next(ended)
             each(lambda values, first: values.__setitem__(ended, first), observation, self._restart(ended.tolist()))
         return observation, outcome.reward.astype(np.float32), done, infos
 
@@ -114,7 +145,7 @@ class AVPVecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """An attribute of the chosen agents, as separate `AVPEnv`s have it."""
         read = _OF_AGENT.get(attr_name, lambda *_: getattr(self, attr_name))
-        return [read(self._task, row) for row in self._get_indices(indices)]
+        return [read(self, row) for row in self._get_indices(indices)]
 
     def has_attr(self, attr_name: str) -> bool:
         """Whether `get_attr` knows the name."""
@@ -135,6 +166,24 @@ class AVPVecEnv(VecEnv):
         """No agent has a Gymnasium wrapper."""
         return [False for _ in self._get_indices(indices)]
 
+    def _change_scene(self) -> None:
+        """Open the pool's next scene where one is due, for the agents of one of the open scenes."""
+        if self._pool is None:
+            return
+        self._stepped += 1
+        changes, since = divmod(self._stepped, self._change_every)
+        if since == 0:
+            rows = np.arange((changes - 1) % self._open_scenes, self.num_envs, self._open_scenes)
+            self._next[rows] = self._task.add_scene(self._pool.open_next(), rows)
+
+    def _enter_next(self, rows: NDArray[np.integer]) -> None:
+        """Let agents whose episode ended enter the next scene, where there is one for them."""
+        moving = rows[self._next[rows] >= 0]
+        self._left |= {row: self._task.simulator(row) for row in moving.tolist()}
+        for scene in np.unique(self._next[moving]).tolist():
+            self._task.enter(moving[self._next[moving] == scene], scene)
+        self._next[moving] = -1
+
     def _restart(self, rows: Sequence[int]) -> Observed:
         draws = [(self._task.simulator(row).area, self._generators[row]) for row in rows]
         position = np.concatenate([area.random_points(generator, 1) for area, generator in draws])
@@ -142,28 +191,43 @@ class AVPVecEnv(VecEnv):
         return self._task.reset(rows, position, yaw)
 
 
-_OF_AGENT = {
-    "area": lambda task, row: task.simulator(row).area,
-    "scene_name": lambda task, row: task.simulator(row).scene,
-    "scene_digest": lambda task, row: task.simulator(row).scene_digest,
-    "simulator": lambda task, row: task.simulator(row),
-    "centre_depth": lambda task, row: task.centre_depth(row),
-    "camera_to_world": lambda task, row: task.camera_to_world[row],
-    "agent_view": lambda task, row: task.agent_view(row),
+_OF_AGENT: dict[str, Callable[[AVPVecEnv, int], Any]] = {
+    "area": lambda env, row: env.simulator_of(row).area,
+    "scene_name": lambda env, row: env.simulator_of(row).scene,
+    "scene_digest": lambda env, row: env.simulator_of(row).scene_digest,
+    "simulator": lambda env, row: env.simulator_of(row),
+    "centre_depth": lambda env, row: env._task.centre_depth(row),
+    "camera_to_world": lambda env, row: env._task.camera_to_world[row],
+    "agent_view": lambda env, row: env._task.agent_view(row),
 }
 
 
-def _open(scene: Scenes, simulator: str | Simulator | Sequence[Simulator], **options: Any) -> list[Simulator]:
+def _open(
+    scene: Scenes,
+    simulator: str | Simulator | Sequence[Simulator],
+    open_scenes: int | None,
+    seed: int | None,
+    **options: Any,
+) -> tuple[ScenePool | None, list[Simulator]]:
+    """The pool, if there is one, and the simulators of the scenes that are open first."""
+    if open_scenes is not None:
+        number("open_scenes", open_scenes, int, Range(1, 1e12))
     choice = SimulatorChoice.by_name(simulator, **options)
     if choice is None:
-        return list(simulator) if isinstance(simulator, Sequence) else [simulator]  # type: ignore[list-item]
+        if open_scenes is not None:
+            raise UsageError(f"open_scenes: expected none beside simulators that are open already, got {open_scenes}")
+        return None, list(simulator) if isinstance(simulator, Sequence) else [simulator]  # type: ignore[list-item]
     scenes = scenes_given(scene, choice)
-    if len(scenes) > 1 and choice.one_per_process:
+    at_a_time = len(scenes) if open_scenes is None else min(open_scenes, len(scenes))
+    if choice.one_per_process and at_a_time > 1:
         raise UsageError(
             f"AVPVecEnv: a process can hold one {choice.name!r} simulator, expected one scene, got {len(scenes)}: "
             f"{', '.join(scenes)}; use AVPSubprocVecEnv (rl_zoo3: --vec-env subproc), which gives each its own process"
         )
-    return [open_simulator(choice, name) for name in scenes]
+    if at_a_time == len(scenes):
+        return None, [open_simulator(choice, name) for name in scenes]
+    pool = ScenePool(scenes, choice, seed)
+    return pool, [pool.open_next() for _ in range(at_a_time)]
 
 
 def scenes_given(scene: Scenes, choice: SimulatorChoice) -> list[str]:

@@ -26,13 +26,16 @@ from avp_habitat.simulators.registry import SimulatorChoice
 from avp_habitat.task.observations import Observed, action_space, each, make_observation
 from avp_habitat.task.settings import TaskSettings
 from avp_sb3.vec_env.batched import AVPVecEnv, Scenes, scenes_given
+from avp_sb3.vec_env.pool import TURNOVER, describe
 
 START_METHODS = ("forkserver", "spawn")
 _GUARD = '; a script that starts workers needs the guard `if __name__ == "__main__":`, because they import it'
 _GRACE_S = 5.0
 """How long a worker may take to end by itself, seconds."""
-_FIXED = ("area", "scene_name", "scene_digest", "settings", "render_mode")
-"""Attributes that never change: known also when the workers have ended, so that the last path can be drawn."""
+_OF_SCENE = ("area", "scene_name", "scene_digest")
+_FIXED = (*_OF_SCENE, "settings", "render_mode")
+"""Attributes that never change, of scenes of a pool excepted: known also when the workers have ended, so that the last
+path can be drawn."""
 
 
 class _Agents(gymnasium.Env):
@@ -81,14 +84,17 @@ class AVPSubprocVecEnv(SubprocVecEnv):
         up: str | None = None,
         settings: TaskSettings | None = None,
         seed: int | None = None,
+        open_scenes: int | None = None,
+        turnover: int = TURNOVER,
         start_method: str = "forkserver",
     ) -> None:
-        """Start the workers, and wait until all scenes are open; the arguments are as of `AVPVecEnv`, but for these.
+        """Start the workers, and wait until their scenes are open; the arguments are as of `AVPVecEnv`, but for these.
 
         `agents` are one for each worker when omitted. `workers` is a multiple of the number of scenes, one for each
         when omitted; agent i is of worker i modulo their number. The simulator is chosen by name. Of several CUDA
-        devices in `gpu`, worker i takes number i modulo theirs. `start_method` is `forkserver` or `spawn`, because a
-        forked process cannot use a graphics device.
+        devices in `gpu`, worker i takes number i modulo theirs. With `open_scenes`, which counts those of all workers,
+        the scenes are shared: worker i of any number up to theirs has scenes i, i + workers, … as a pool of its own.
+        `start_method` is `forkserver` or `spawn`, because a forked process cannot use a graphics device.
 
         Raises:
             UsageError: numbers that do not fit each other, or an unknown name.
@@ -102,9 +108,8 @@ class AVPSubprocVecEnv(SubprocVecEnv):
             raise UsageError(f"start_method: expected one of {', '.join(START_METHODS)}, got {start_method!r}")
         self.scenes = scenes_given(scene, choices[0])
         """Of the agents in turn, as given."""
-        count = len(self.scenes) if workers is None else workers
-        if count < 1 or count % len(self.scenes):
-            raise UsageError(f"workers: expected a multiple of the number of scenes, {len(self.scenes)}, got {workers}")
+        self._is_pool = open_scenes is not None and open_scenes < len(self.scenes)
+        count = _workers(len(self.scenes), workers, is_pool=self._is_pool)
         self._count, self._workers = count, range(count)
         agents = count if agents is None else agents
         if agents < count:
@@ -116,8 +121,11 @@ class AVPSubprocVecEnv(SubprocVecEnv):
             partial(
                 _Agents,
                 self.settings,
-                scene=self.scenes[worker % len(self.scenes)],
+                scene=self._scenes_of(worker),
                 agents=len(range(worker, agents, count)),
+                open_scenes=-(-open_scenes // count) if open_scenes is not None and self._is_pool else None,
+                turnover=turnover,
+                seed=seed,
                 **vars(choices[worker % len(choices)]),
             )
             for worker in self._workers
@@ -129,11 +137,17 @@ class AVPSubprocVecEnv(SubprocVecEnv):
             weakref.finalize(self, _end, self.remotes, self.processes)
             # SB3 has counted the workers.
             VecEnv.__init__(self, agents, self.observation_space, self.action_space)
-            self._fixed = {name: self._of_agents(self._workers, "get_attr", name) for name in _FIXED}
+            fixed = [name for name in _FIXED if not (self._is_pool and name in _OF_SCENE)]
+            self._fixed = {name: self._of_agents(self._workers, "get_attr", name) for name in fixed}
         except BaseException:
             self.close()
             raise
         self.seed(seed)
+
+    @property
+    def pool(self) -> str | None:
+        """As of `AVPVecEnv`, of all workers together."""
+        return describe(self.scenes) if self._is_pool else None
 
     def reset(self) -> Observed:  # type: ignore[override]
         """Start all episodes at random; the first axis of what is observed is n."""
@@ -169,13 +183,15 @@ class AVPSubprocVecEnv(SubprocVecEnv):
         rows = self._get_indices(indices)
         if attr_name == "simulator":
             raise UsageError("AVPSubprocVecEnv: simulator stays in its process; ask for area, scene_name or agent_view")
+        if attr_name == "pool":
+            return [self.pool for _ in rows]
         if attr_name in self._fixed:
             return [self._fixed[attr_name][row % self._count] for row in rows]
         return self._of_agents(rows, "get_attr", attr_name)
 
     def has_attr(self, attr_name: str) -> bool:
         """Whether `get_attr` knows the name."""
-        if attr_name in self._fixed or attr_name == "simulator":
+        if attr_name in ("pool", "simulator", *self._fixed):
             return attr_name != "simulator"
         self._send("has_attr", {0: ((attr_name,), {})})
         return self._receive()[0]
@@ -242,13 +258,26 @@ class AVPSubprocVecEnv(SubprocVecEnv):
             raise SimulatorError(f"{self._name(worker)} {how}; the other workers were ended{hint}") from None
 
     def _name(self, worker: int) -> str:
-        return f"worker {worker} of {self._count} (scene {self.scenes[worker % len(self.scenes)]})"
+        return f"worker {worker} of {self._count} (scene {describe(self._scenes_of(worker))})"
+
+    def _scenes_of(self, worker: int) -> list[str]:
+        return self.scenes[worker :: self._count] if self._is_pool else [self.scenes[worker % len(self.scenes)]]
 
     def _joined(self, *arrays: NDArray) -> NDArray:
         joined = np.empty((self.num_envs, *arrays[0].shape[1:]), arrays[0].dtype)
         for worker, array in enumerate(arrays):
             joined[worker :: self._count] = array
         return joined
+
+
+def _workers(scenes: int, asked: int | None, *, is_pool: bool) -> int:
+    """How many workers; a pool's share its scenes, others have one scene each."""
+    count = (1 if is_pool else scenes) if asked is None else asked
+    if is_pool and not 1 <= count <= scenes:
+        raise UsageError(f"workers: expected 1 to {scenes}, the number of scenes, got {asked}")
+    if not is_pool and (count < 1 or count % scenes):
+        raise UsageError(f"workers: expected a multiple of the number of scenes, {scenes}, got {asked}")
+    return count
 
 
 def _how_it_ended(process: BaseProcess) -> str:
