@@ -13,7 +13,7 @@ from avp_habitat.scenes.builtin.room import lit_room
 from avp_habitat.scenes.builtin.shapes import Material
 from avp_habitat.scenes.mesh import TexturedMesh, merge
 
-HOME_VERSION = 1
+HOME_VERSION = 2
 """Rises whenever a seed's home changes, so that results name the home that they were measured in."""
 _TRIES = 40
 _STREAMS = 1 << 20

@@ -116,6 +116,12 @@ def _connected(rng: Random, cells: list[Plot], uses: list[str]) -> list[tuple[in
     return chosen if len(set(part)) == 1 else None
 
 
+def _without_passage_baths(uses: list[str], walls: list[tuple[int, _Stretch]]) -> list[str]:
+    """The same uses, but that nobody has to cross a bath."""
+    ends = [end for behind, wall in walls for end in (behind, wall.cell)]
+    return ["study" if use == "bath" and ends.count(index) > 1 else use for index, use in enumerate(uses)]
+
+
 def _inner(cell: Plot) -> Rectangle:
     """The floor between a cell's walls."""
     half = WALL_M / 2
@@ -183,6 +189,7 @@ def plan_home(rng: Random, count: int) -> list[Room] | None:
     walls = _connected(rng, cells, uses)
     if walls is None:
         return None
+    uses = _without_passage_baths(uses, walls)
     openings, outer, ceilings = _doorways(rng, cells, walls), _outer(cells), _ceilings(rng, uses)
     _add_front_door(cells, uses, outer, openings)
     _add_windows(rng, cells, outer, ceilings, openings)
