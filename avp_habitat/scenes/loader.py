@@ -1,7 +1,7 @@
 """From what the user calls a scene to its mesh in the world: read, checked, turned, moved to a local origin."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import numpy as np
 from avp_habitat.errors import SceneError
 from avp_habitat.poses import axes_to_world
 from avp_habitat.scenes.files import SceneFiles
-from avp_habitat.scenes.location import BUILTIN, Frame, SceneLocation, locate
+from avp_habitat.scenes.location import HOME, Frame, SceneLocation, locate
 from avp_habitat.scenes.mesh import TexturedMesh, warn_once
 from avp_habitat.scenes.obj import read_obj
 from avp_habitat.scenes.ply import read_ply
@@ -29,7 +29,7 @@ class Scene:
     """A scene in memory."""
 
     name: str
-    """What the user called it, without folders: a file's name or `builtin:SEED`."""
+    """What the user called it, without folders: a file's name, `builtin:SEED` or `builtin-home:SEED`."""
     digest: str
     """Hexadecimal SHA-256 of the content; see `identify`."""
     mesh: TexturedMesh
@@ -57,9 +57,8 @@ def load_scene(spec: str | Path, *, up: str | None = None, origin: Sequence[floa
 def load_located(location: SceneLocation, *, origin: Sequence[float] | None = None) -> Scene:
     """Load a scene that was located; arguments and errors as of `load_scene`."""
     if location.asset is None:
-        from avp_habitat.scenes.builtin.room import generate_room
-
-        return Scene(location.name, identify(location)[0], generate_room(int(location.name.removeprefix(BUILTIN))))
+        generate, _ = _generator(location.name)
+        return Scene(location.name, identify(location)[0], generate(int(location.name.partition(":")[2])))
     if location.objects:
         raise SceneError(
             f"{location.dataset}:{location.scene_id}: has {location.objects} objects besides its stage, which raycast "
@@ -70,17 +69,27 @@ def load_located(location: SceneLocation, *, origin: Sequence[float] | None = No
     return Scene(location.name, _digest(location, files), mesh, frame)
 
 
+def _generator(name: str) -> tuple[Callable[[int], TexturedMesh], int]:
+    """What makes a scene of such a name from its seed, and the version of that."""
+    if name.startswith(HOME):
+        from avp_habitat.scenes.builtin.home.home import HOME_VERSION, generate_home
+
+        return generate_home, HOME_VERSION
+    from avp_habitat.scenes.builtin.room import GENERATOR_VERSION, generate_room
+
+    return generate_room, GENERATOR_VERSION
+
+
 def identify(location: SceneLocation) -> tuple[str, Frame]:
     """Digest and frame of a scene, the same as those of the loaded scene; SceneError where the mesh cannot be read.
 
     The digest is the hexadecimal SHA-256 of what the scene is made of: of the mesh and the files that it refers to;
     where a scene has configs or axes other than Y up, -Z front, of those too (of objects, the config that names them);
-    of a generated room of the seed and the generator's version.
+    of a generated room or home of its name and the generator's version.
     """
     if location.asset is None:
-        from avp_habitat.scenes.builtin.room import GENERATOR_VERSION
-
-        return hashlib.sha256(f"{location.name}:v{GENERATOR_VERSION}".encode()).hexdigest(), Frame()
+        _, version = _generator(location.name)
+        return hashlib.sha256(f"{location.name}:v{version}".encode()).hexdigest(), Frame()
     files = SceneFiles(location.asset)
     frame = Frame(up=location.chosen_up)
     try:

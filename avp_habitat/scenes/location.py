@@ -26,7 +26,8 @@ from avp_habitat.scenes.stage_config import (
     shown,
 )
 
-BUILTIN = "builtin:"
+ROOM, HOME = "builtin:", "builtin-home:"
+"""What the names of generated scenes begin with; a seed follows."""
 UPS = ("y", "z")
 """Axes of a mesh file that can point up."""
 DATASET_CONFIG = ".scene_dataset_config.json"
@@ -34,7 +35,7 @@ SCENE_INSTANCE = ".scene_instance.json"
 _SHOWN_NAMES = 5
 HELP = (
     f"a mesh ({' '.join(SUFFIXES)}), a scene folder of Replica, NAME{STAGE_CONFIG}, NAME{DATASET_CONFIG}:ID, or "
-    f"{BUILTIN}SEED for a generated room"
+    f"{ROOM}SEED or {HOME}SEED for a generated room or home"
 )
 """What a command line says of its option for scenes."""
 UP_HELP = "axis of a mesh file that points up (omitted: y, of Replica's files z)"
@@ -56,8 +57,9 @@ def locate(spec: str | Path, *, up: str | None = None) -> SceneLocation:
 
     Args:
         spec: path of a `.glb`, `.gltf`, `.ply` or `.obj` file (Y up); scene folder of Replica or a mesh in it (Z up);
-            `NAME.stage_config.json`; `NAME.scene_dataset_config.json:ID`; or `builtin:SEED` for a generated room.
-        up: axis of a mesh file that points up, `y` or `z`, whatever its folder says; generated rooms are Y-up.
+            `NAME.stage_config.json`; `NAME.scene_dataset_config.json:ID`; `builtin:SEED` or `builtin-home:SEED` for a
+            generated room or home.
+        up: axis of a mesh file that points up, `y` or `z`, whatever its folder says; generated scenes are Y-up.
 
     Raises:
         UsageError: nothing that a scene could be called, a dataset config without an id, or `up` beside a config,
@@ -66,11 +68,8 @@ def locate(spec: str | Path, *, up: str | None = None) -> SceneLocation:
             missing or lies outside of the data set's folder (of a stage config alone: the folder above its own).
     """
     spec = os.fspath(spec)
-    if spec.startswith(BUILTIN):
-        seed = spec.removeprefix(BUILTIN)
-        if not (seed.isascii() and seed.isdigit()):
-            raise UsageError(f"{spec}: expected {BUILTIN}SEED with an integer SEED >= 0, got {seed!r}")
-        return SceneLocation(f"{BUILTIN}{int(seed)}", None)
+    if spec.startswith((ROOM, HOME)):
+        return _generated(spec)
     dataset, mark, scene_id = spec.partition(f"{DATASET_CONFIG}:")
     path = Path(f"{dataset}{DATASET_CONFIG}" if mark else spec)
     if up is not None and path.name.endswith((DATASET_CONFIG, STAGE_CONFIG)):
@@ -87,6 +86,14 @@ def locate(spec: str | Path, *, up: str | None = None) -> SceneLocation:
         return found
     axes = {"y": Y_UP, "z": Z_UP}[up]
     return replace(found, up=axes[0], front=axes[1], chosen_up=up)
+
+
+def _generated(spec: str) -> SceneLocation:
+    """A scene that is made from a seed."""
+    kind, mark, seed = spec.partition(":")
+    if not (seed.isascii() and seed.isdigit()):
+        raise UsageError(f"{spec}: expected {kind}{mark}SEED with an integer SEED >= 0, got {seed!r}")
+    return SceneLocation(f"{kind}{mark}{int(seed)}", None)
 
 
 def _mesh_of(path: Path) -> Path:

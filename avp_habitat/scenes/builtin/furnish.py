@@ -25,7 +25,7 @@ _MIDDLE_M = 1.6
 """Height at which the middle of a picture hangs."""
 _MAIN, _EXTRA, _SMALL = 0.45, 0.42, 0.41
 """Share of the floor that stays walkable after placing main groups, storage, and what fills corners."""
-_Spots = Callable[[Wall], list[Point]]
+Spots = Callable[[Wall], list[Point]]
 """Where a group may stand at a wall: metres along it and in front of it."""
 _MOST_SPOTS = 120
 
@@ -110,7 +110,7 @@ class FloorPlan:
         self.rugs: list[Block] = []
         for hole in shell.openings:
             wall = shell.walls[hole.wall]
-            if hole.kind == "door":
+            if hole.kind != "window":
                 self.blocks.append(_before(wall, (hole.left - 0.1, 0.0, hole.right + 0.1, 1.0), 0.03, 2.1))
                 continue
             self.blocks.append(_before(wall, (hole.left, 0.0, hole.right, 0.4), hole.bottom, hole.top))
@@ -131,13 +131,17 @@ class FloorPlan:
         ]
         if not all(self.shell.contains(*block.area) for block in areas) or self._are_in_the_way(solids, rugs, areas):
             return False
-        standing = [block.area for block in [*self.blocks, *solids] if block.solid]
-        if _walkable_share(self.shell, standing) < least_share:
+        if self.walkable_share(solids) < least_share:
             return False
         self.placed += stands
         self.blocks += solids + areas
         self.rugs += rugs
         return True
+
+    def walkable_share(self, more: list[Block] | None = None) -> float:
+        """Share of the floor that stays walkable, with more furniture perhaps."""
+        standing = [block.area for block in [*self.blocks, *(more or [])] if block.solid]
+        return _walkable_share(self.shell, standing)
 
     def _are_in_the_way(self, solids: list[Block], rugs: list[Block], areas: list[Block]) -> bool:
         """Whether new furniture, rugs, or the floor in front of them, meet what is there.
@@ -210,17 +214,17 @@ def _hang_one(floor: FloorPlan, rng: Random, kit: Kit, wall: Wall, right: float,
     return True
 
 
-def _hang_pictures(floor: FloorPlan, rng: Random, kit: Kit) -> None:
-    """Pictures on every wall that has room for them, one clock in some rooms."""
+def hang_pictures(floor: FloorPlan, rng: Random, kit: Kit, most: int = 100) -> None:
+    """Pictures on every wall that has room for them, up to a number, one clock in some rooms."""
     clock = rng.chance(0.6)
     for wall in rng.shuffled(floor.shell.walls):
         wanted = 3 if wall.length > 3 else 1
         for right in rng.shuffled(places(0.5, wall.length - 0.4, 0.2)):
-            if wanted and _hang_one(floor, rng, kit, wall, right, clock=clock):
-                wanted, clock = wanted - 1, False
+            if wanted and most and _hang_one(floor, rng, kit, wall, right, clock=clock):
+                wanted, most, clock = wanted - 1, most - 1, False
 
 
-def _hang_lamp(floor: FloorPlan, rng: Random, kit: Kit) -> None:
+def hang_lamp(floor: FloorPlan, rng: Random, kit: Kit) -> None:
     """A pendant above the dining table, or where the room is open."""
     ceiling, (x0, z0, x1, z1) = floor.shell.ceiling, floor.shell.bounds
     tables = [stand.position for stand in floor.placed if stand.piece.kind == "dining table"]
@@ -234,7 +238,7 @@ def _hang_lamp(floor: FloorPlan, rng: Random, kit: Kit) -> None:
             return
 
 
-def _put(floor: FloorPlan, rng: Random, arrange: Arrange, spots: _Spots, least_share: float) -> bool:
+def put(floor: FloorPlan, rng: Random, arrange: Arrange, spots: Spots, least_share: float) -> bool:
     """Place a group at the first spot, in random order, where it fits and leaves enough of the floor walkable."""
     for wall in rng.shuffled([wall for wall in floor.shell.walls if spots(wall)]):
         for right, inwards in rng.shuffled(spots(wall))[:_MOST_SPOTS]:
@@ -244,15 +248,18 @@ def _put(floor: FloorPlan, rng: Random, arrange: Arrange, spots: _Spots, least_s
     return False
 
 
-def _at_wall(wall: Wall) -> list[Point]:
+def at_wall(wall: Wall) -> list[Point]:
+    """Along the whole wall."""
     return [(right, 0.0) for right in places(0.3, wall.length - 0.3, 0.2)]
 
 
-def _in_corners(wall: Wall) -> list[Point]:
+def in_corners(wall: Wall) -> list[Point]:
+    """Beside both ends."""
     return [(0.42, 0.0), (wall.length - 0.42, 0.0)]
 
 
-def _anywhere(wall: Wall) -> list[Point]:
+def anywhere(wall: Wall) -> list[Point]:
+    """Up to 4 m in front of the wall."""
     return [(r, i) for r in places(0.6, wall.length - 0.5, 0.3) for i in places(0.1, 4.0, 0.3)]
 
 
@@ -272,7 +279,7 @@ def _storage(kit: Kit, rng: Random) -> list[Arrange]:
 
 def _put_living(floor: FloorPlan, rng: Random, kit: Kit) -> bool:
     """Sofa, television and what belongs to them, as much as fits."""
-    return any(_put(floor, rng, arrange, _at_wall, _MAIN) for arrange in groups.living(kit, rng))
+    return any(put(floor, rng, arrange, at_wall, _MAIN) for arrange in groups.living(kit, rng))
 
 
 def _put_main_groups(floor: FloorPlan, rng: Random, kit: Kit) -> None:
@@ -281,26 +288,26 @@ def _put_main_groups(floor: FloorPlan, rng: Random, kit: Kit) -> None:
     sleeps = rng.chance(0.6 if area > 22 else 0.4)
     sits = area > 20 or not sleeps
     sits = sits and _put_living(floor, rng, kit)
-    sleeps = (sleeps or not sits) and _put(floor, rng, groups.sleeping(kit, rng), _at_wall, _MAIN)
+    sleeps = (sleeps or not sits) and put(floor, rng, groups.sleeping(kit, rng), at_wall, _MAIN)
     if not sits and not sleeps:
         sits = _put_living(floor, rng, kit)
     if not (sits and sleeps) or area > 30:
-        _put(floor, rng, groups.dining(kit, rng), _anywhere, _MAIN)
-    any(_put(floor, rng, arrange, _across, _MAIN) for arrange in groups.divider(kit, rng, floor.shell.ceiling))
+        put(floor, rng, groups.dining(kit, rng), anywhere, _MAIN)
+    any(put(floor, rng, arrange, _across, _MAIN) for arrange in groups.divider(kit, rng, floor.shell.ceiling))
 
 
 def _put_the_rest(floor: FloorPlan, rng: Random, kit: Kit) -> None:
     """Desk, storage, a place to read, and what fills corners, as long as the floor stays walkable."""
     first, *rest = _storage(kit, rng)
     for arrange in (groups.working(kit, rng), first):
-        _put(floor, rng, arrange, _at_wall, _EXTRA)
-    any(_put(floor, rng, arrange, _at_wall, _EXTRA) for arrange in groups.reading(kit, rng))
+        put(floor, rng, arrange, at_wall, _EXTRA)
+    any(put(floor, rng, arrange, at_wall, _EXTRA) for arrange in groups.reading(kit, rng))
     for arrange in rest:
-        _put(floor, rng, arrange, _at_wall, _EXTRA)
+        put(floor, rng, arrange, at_wall, _EXTRA)
     for _ in range(2):
-        _put(floor, rng, groups.against_wall(decor.plant(kit, rng), 0.0), _in_corners, _SMALL)
+        put(floor, rng, groups.against_wall(decor.plant(kit, rng), 0.0), in_corners, _SMALL)
     if sum(stand.piece.kind == "side table" for stand in floor.placed) < 2:
-        _put(floor, rng, groups.against_wall(seating.side_table(kit, rng), 0.3), _at_wall, _SMALL)
+        put(floor, rng, groups.against_wall(seating.side_table(kit, rng), 0.3), at_wall, _SMALL)
 
 
 def furnish(shell: Shell, rng: Random, kit: Kit) -> list[Placed]:
@@ -308,6 +315,6 @@ def furnish(shell: Shell, rng: Random, kit: Kit) -> list[Placed]:
     floor = FloorPlan(shell)
     _put_main_groups(floor, rng, kit)
     _put_the_rest(floor, rng, kit)
-    _hang_lamp(floor, rng, kit)
-    _hang_pictures(floor, rng, kit)
+    hang_lamp(floor, rng, kit)
+    hang_pictures(floor, rng, kit)
     return floor.placed

@@ -1,6 +1,7 @@
 """The colours and materials that one room is furnished with, and the pieces that are made of them."""
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -183,6 +184,13 @@ class Kit:
     def colours(self) -> list[Colour]:
         """Accents and the main colours, at least four."""
         return [*self.scheme.accents, self.scheme.feature, self.scheme.upholstery]
+
+    def variant(self, number: int, **materials: Material) -> "Kit":
+        """The same materials but for those given, with views, paintings and rugs of its own for each number."""
+        made = copy(self)
+        made._count = 1000 * number
+        vars(made).update(materials)
+        return made
 
     def _unique(self, paint: Callable[[Random], Picture], *, glows: bool = False) -> Material:
         self._count += 1

@@ -14,6 +14,8 @@ Point = tuple[float, float]
 """x, z on the floor in metres, or a direction there."""
 CURTAIN_M = 0.3
 """Width of a drawn curtain beside its window."""
+WALL_M = 0.12
+"""Thickness of a wall between two rooms."""
 _RECESS_M = 0.14
 _SLACK_M = 1e-6
 
@@ -45,7 +47,10 @@ class Wall:
 
 @dataclass(frozen=True)
 class Opening:
-    """A `window` or `door` (its kind) in the wall of an index: metres from its left end, and above the floor."""
+    """A `window`, a closed `door` or an open `passage` (its kind) in the wall of an index.
+
+    Metres from the wall's left end, and above the floor.
+    """
 
     wall: int
     left: float
@@ -130,7 +135,8 @@ def _outline(rng: Random) -> tuple[tuple[Point, ...], Rectangle | None]:
     return tuple(corners), (min(a, c), min(b, d), max(a, c), max(b, d))
 
 
-def _window(rng: Random, wall: int, length: float, ceiling: float) -> Opening:
+def plan_window(rng: Random, wall: int, length: float, ceiling: float) -> Opening:
+    """A window somewhere in the middle of a stretch of wall, metres; at least 2.4 long."""
     width = min(rng.uniform(1.1, 2.0), length - 1.4)
     left = round((length - width) * rng.uniform(0.35, 0.65), 2)
     bottom = rng.choice((0.85, 0.9, 0.95, 0.55))
@@ -146,7 +152,7 @@ def plan_shell(rng: Random) -> Shell:
     left = 0.3 if rng.chance(0.5) else round(shell.walls[first].length - 1.2, 2)
     openings = [Opening(first, left, round(left + 0.9, 2), 0.0, 2.05, "door")]
     windows = rng.integer(1, 2) if shell.floor_area < 24 else rng.integer(2, 3)
-    openings += [_window(rng, index, shell.walls[index].length, ceiling) for index in others[:windows]]
+    openings += [plan_window(rng, index, shell.walls[index].length, ceiling) for index in others[:windows]]
     return replace(shell, openings=tuple(openings))
 
 
@@ -192,18 +198,40 @@ def _window_surfaces(kit: Kit, hole: Opening) -> list[MeshSurface]:
 
 def _door(kit: Kit, hole: Opening) -> list[MeshSurface]:
     left, right, top, deep = hole.left, hole.right, hole.top, 0.06
-    width, middle = right - left, (left + right) / 2
+    width = right - left
     made = _reveal(left, right, 0.0, top, deep, kit.trim)
     made.append(panel((left, top, -deep), (width, 0.0, 0.0), (0.0, -top, 0.0), kit.wood, turned=True))
+    made += leaf_front(kit, left, right, -deep)
+    return made + _architrave(kit, hole)
+
+
+def leaf_front(kit: Kit, left: float, right: float, z: float) -> list[MeshSurface]:
+    """Panels and handle of a door's leaf whose front is at z, hinged on the left; metres in the wall's frame."""
+    made: list[MeshSurface] = []
+    width = right - left
     for y, tall in ((0.55, 0.7), (1.45, 0.85)):
         for x in (left + width * 0.28, left + width * 0.72):
-            made += box((width * 0.32, tall, 0.016), (x, y, 0.01 - deep), kit.wood, pitch=0.5)
-            made += box((width * 0.24, tall - 0.1, 0.016), (x, y, 0.02 - deep), kit.dark_wood, pitch=0.5)
-    made += box((0.12, 0.02, 0.03), (right - 0.13, 1.02, 0.03 - deep), kit.metal, pitch=1)
-    made += box((0.03, 0.16, 0.012), (right - 0.08, 1.0, 0.008 - deep), kit.metal, pitch=1)
+            made += box((width * 0.32, tall, 0.016), (x, y, 0.01 + z), kit.wood, pitch=0.5)
+            made += box((width * 0.24, tall - 0.1, 0.016), (x, y, 0.02 + z), kit.dark_wood, pitch=0.5)
+    made += box((0.12, 0.02, 0.03), (right - 0.13, 1.02, 0.03 + z), kit.metal, pitch=1)
+    return made + box((0.03, 0.16, 0.012), (right - 0.08, 1.0, 0.008 + z), kit.metal, pitch=1)
+
+
+def _architrave(kit: Kit, hole: Opening) -> list[MeshSurface]:
+    """The boards around a door or passage."""
+    left, right, top = hole.left, hole.right, hole.top
+    made: list[MeshSurface] = []
     for x in (left - 0.04, right + 0.04):
         made += box((0.08, top + 0.08, 0.022), (x, (top + 0.08) / 2, 0.011), kit.trim, pitch=0.6)
-    return made + box((width, 0.08, 0.021), (middle, top + 0.04, 0.0105), kit.trim, pitch=0.6)
+    return made + box((right - left, 0.08, 0.021), ((left + right) / 2, top + 0.04, 0.0105), kit.trim, pitch=0.6)
+
+
+def _passage(kit: Kit, hole: Opening) -> list[MeshSurface]:
+    """This room's half of an open doorway through a wall, with a sill of wood."""
+    left, right = hole.left, hole.right
+    made = _reveal(left, right, 0.0, hole.top, WALL_M / 2, kit.trim)[:3]
+    made.append(panel((left, 0.0, -WALL_M / 2), (right - left, 0.0, 0.0), (0.0, 0.0, WALL_M / 2), kit.wood))
+    return made + _architrave(kit, hole)
 
 
 def _drape(kit: Kit, left: float, right: float, bottom: float, top: float) -> list[MeshSurface]:
@@ -234,8 +262,8 @@ def curtain_bottom(shell: Shell, hole: Opening) -> float:
 
 
 def _skirting(kit: Kit, wall: Wall, holes: list[Opening]) -> list[MeshSurface]:
-    beside = [edge for hole in holes if hole.kind == "door" for edge in (hole.left - 0.08, hole.right + 0.08)]
-    edges = [0.0, *beside, wall.length]
+    beside = [edge for hole in holes if hole.kind != "window" for edge in (hole.left - 0.08, hole.right + 0.08)]
+    edges = [0.0, *sorted(beside), wall.length]
     made = []
     for left, right in zip(edges[::2], edges[1::2], strict=True):
         if right - left > 0.02:
@@ -250,10 +278,10 @@ def _wall(kit: Kit, shell: Shell, index: int, material: Material) -> list[MeshSu
     cut = tuple((hole.left, high - hole.top, hole.right, high - hole.bottom) for hole in holes)
     made = [panel((0.0, high, 0.0), (wall.length, 0.0, 0.0), (0.0, -high, 0.0), material, pitch=0.25, holes=cut)]
     for hole in holes:
-        if hole.kind == "door":
-            made += _door(kit, hole)
-        else:
+        if hole.kind == "window":
             made += _window_surfaces(kit, hole) + _curtains(kit, hole, curtain_bottom(shell, hole))
+        else:
+            made += _door(kit, hole) if hole.kind == "door" else _passage(kit, hole)
     made += _skirting(kit, wall, holes)
     return moved(made, wall.axes(), np.array([wall.start[0], 0.0, wall.start[1]]))
 

@@ -1,0 +1,1 @@
+"""Homes made from a seed: `builtin-home:SEED`."""
