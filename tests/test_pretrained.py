@@ -1,4 +1,5 @@
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 from tracking import SETTINGS, SmallEnv, ppo
 
+from avp_experiment.configuration import chosen_methods
 from avp_habitat import collect, command
 from avp_habitat.errors import PolicyError, UsageError
 from avp_habitat.policies import weights
@@ -141,7 +143,10 @@ def tampered(path):
             lambda path: changed(path, actor=[{"inputs": 12, "outputs": 6, "activation": None}]),
             "actor.0.weight of shape",
         ),
-        (lambda path: changed(path, observation={"kind": "numbers", "shape": [13]}), r"actor\.0\.weight of shape \(64, 13\), found \(64, 12\)"),
+        (
+            lambda path: changed(path, observation={"kind": "numbers", "shape": [13]}),
+            r"actor\.0\.weight of shape \(64, 13\), found \(64, 12\)",
+        ),
         (lambda path: path.with_suffix(".safetensors").unlink(), "expected one NAME.json .* found none"),
         (lambda path: path.write_text("{}"), r"m\.json: expected a policy as `python -m avp_sb3.export` writes it"),
     ],
@@ -264,6 +269,19 @@ def test_the_batched_evaluation_takes_it(folder):
     env = AVPVecEnv(agents=2, simulator=Corridor(), settings=SETTINGS, seed=0)
     found = run_batch(PretrainedPolicy.load(str(folder)), env, 3, seed=1, deterministic=True)
     assert [len(episodes) for episodes in found.values()] == [3]
+
+
+def test_the_experiment_takes_it_with_the_reward_it_learned_from(folder, tmp_path):
+    shutil.copytree(folder, own := tmp_path / "own")
+    changed(own / "m.json", settings={"reward": "surface"})
+    (method, other) = chosen_methods([str(own), "random"])[::-1]
+    assert (method.spec, method.reward, method.learned) == (str(own), "surface", False)
+    assert "/" not in method.name
+    assert other.reward == "coverage"
+    changed(own / "m.json", settings={"reward": "evil:reward"})
+    assert method.reward == "coverage"
+    with pytest.raises(UsageError, match="unknown method"):
+        chosen_methods(["heuristc"])
 
 
 def test_the_package_has_its_default_weights():

@@ -112,7 +112,7 @@ def _difference(weights: PolicyWeights, path: Path, observations: NDArray[np.flo
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    found = session.run([OUTPUT], {INPUT: observations})[0]
+    found = np.asarray(session.run([OUTPUT], {INPUT: observations})[0])
     expected = PretrainedPolicy(weights).logits(observations)
     difference = float(np.abs(found - expected).max())
     close = difference <= CLOSE * max(1.0, float(np.abs(expected).max()))

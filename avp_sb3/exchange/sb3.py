@@ -204,10 +204,10 @@ def started_ppo(start: str, env: Any, **arguments: Any) -> Any:
     if offered != (weights.shape, len(weights.actor[-1].bias)):
         made = f"observations of shape {weights.shape} and {len(weights.actor[-1].bias)} actions"
         raise UsageError(f"--start {start}: made for {made}, but this task has {offered[0]} and {offered[1]}")
-    activations = {layer.activation for layer in (*weights.actor[:-1], *weights.critic[:-1])} or {"tanh"}
-    if len(activations) != 1 or None in activations:
-        raise UsageError(f"--start {start}: a training has one activation, found {', '.join(map(str, activations))}")
-    torch_name = {ours: name for name, ours in _TORCH.items()}[activations.pop()]
+    found = {str(layer.activation) for layer in (*weights.actor[:-1], *weights.critic[:-1])} or {"tanh"}
+    if len(found) != 1:
+        raise UsageError(f"--start {start}: expected one activation in all layers, found {', '.join(sorted(found))}")
+    torch_name = {ours: name for name, ours in _TORCH.items()}[found.pop()]
     sizes = {"pi": _hidden(weights.actor), "vf": _hidden(weights.critic)}
     if weights.statistics is not None:
         env = _normalised(env, weights.statistics)
