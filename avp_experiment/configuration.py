@@ -32,12 +32,23 @@ class Method:
     @property
     def name(self) -> str:
         """In files and tables."""
-        return self.spec.replace(":", ".") + (ROOMS if self.in_rooms else "")
+        return self.spec.strip("./").replace(":", ".").replace("/", ".") + (ROOMS if self.in_rooms else "")
 
     @property
     def reward(self) -> str:
-        """What it learns from; of a baseline, which has no use for it, one without a stop."""
-        return self.spec if self.learned else "coverage"
+        """What it learns, or its weights learned, from; of a baseline, which has no use for it, one without a stop."""
+        return self.spec if self.learned else _learned_from(self.spec) or "coverage"
+
+
+def _learned_from(policy: str) -> str | None:
+    """The reward that an exported policy's file names, so that stops end episodes as in its training."""
+    from avp_habitat.policies.registry import exported_file
+    from avp_habitat.policies.weights.format import read_facts
+
+    path = exported_file(policy)
+    told = None if path is None else read_facts(path)["settings"].get("reward")
+    # No file chooses what is imported.
+    return told if told in plugins.names("avp.rewards", REWARDS) else None
 
 
 def known_methods() -> dict[str, Method]:
@@ -57,18 +68,22 @@ DEFAULT = (*BASELINES, *REWARDS, f"proposed{ROOMS}", f"surface{ROOMS}")
 
 
 def chosen_methods(names: Sequence[str]) -> tuple[Method, ...]:
-    """The methods of these names, each once: known ones in their order, then those of the form `module:object`.
+    """The methods of these names, each once: known ones in their order, then exported policies and `module:object`.
 
-    That is a class or object with `predict`, or else a reward, whose name may end in `_rooms`.
+    The latter is a class or object with `predict`, or else a reward, whose name may end in `_rooms`.
     """
+    from avp_habitat.policies.registry import exported_file
+
     if not names:
         raise UsageError("methods: expected at least one, got none")
     known = known_methods()
+    exported = {name: None for name in names if exported_file(name) is not None}
     for name in names:
-        if ":" not in name and name not in known:
+        if ":" not in name and name not in known and name not in exported:
             raise unknown_name("method", name, known)
     chosen = [method for name, method in known.items() if name in names]
-    for name in dict.fromkeys(name for name in names if ":" in name):
+    chosen += [Method(name) for name in exported if name not in known]
+    for name in dict.fromkeys(name for name in names if ":" in name and name not in exported):
         spec = name.removesuffix(ROOMS)
         learned = not hasattr(plugins.find("avp.policies", spec, {}), "predict")
         chosen.append(Method(spec, learned, in_rooms=learned and name != spec))

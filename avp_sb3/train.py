@@ -22,6 +22,7 @@ from avp_habitat.simulators.registry import SimulatorChoice
 from avp_habitat.task.rewards import REWARDS_HELP
 from avp_habitat.task.settings import OBSERVATIONS_HELP, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
+from avp_sb3.exchange.sb3 import note_training, start_observation, started_ppo
 from avp_sb3.presets import MAP, PRESETS, PPOPreset
 from avp_sb3.vec_env.pool import TURNOVER, describe
 
@@ -48,7 +49,10 @@ class Train:
     turnover: Annotated[int, Range(1, _MOST)] = TURNOVER
     """With rooms or homes: a scene is held for the steps of so many whole episodes."""
     reward: Annotated[str, arg(help=REWARDS_HELP)] = "proposed"
-    observation: Annotated[str, arg(help=f"{OBSERVATIONS_HELP}; also chooses PPO's settings")] = "numbers"
+    observation: Annotated[
+        str | None,
+        arg(help=f"{OBSERVATIONS_HELP}; also chooses PPO's settings (omitted: numbers, or that of --start)"),
+    ] = None
     metrics: Annotated[tuple[str, ...], arg(help=METRICS_HELP)] = ()
     steps: Annotated[int, Range(1, _MOST)] = 300_000
     """Environment steps in total."""
@@ -70,6 +74,9 @@ class Train:
     """The model; also written after Ctrl-C."""
     resume: Annotated[str | None, arg(metavar="MODEL")] = None
     """Go on until --steps are done with a model: a file, or MLflow's runs:/RUN_ID/model.zip."""
+    start: Annotated[str | None, arg(metavar="POLICY")] = None
+    """Begin with the weights of a policy: pretrained, another name of `python -m avp_sb3.pretrained`, or the folder of
+    one that `python -m avp_sb3.export` wrote."""
     trusted: Annotated[bool, arg(help=TRUSTED)] = False
     eval_scene: Annotated[tuple[str, ...] | None, arg(metavar="SCENE")] = None
     """Evaluate in these too, and keep the best model."""
@@ -84,6 +91,13 @@ class Train:
     def __post_init__(self) -> None:
         """Refuse what cannot be right."""
         hold_ranges(self)
+        if self.start is not None and self.resume is not None:
+            raise UsageError("start: expected one of --start and --resume, got both")
+        # A training's observation is known from here on, so that nothing else asks where it came from.
+        kind = "numbers" if self.observation is None else self.observation
+        object.__setattr__(
+            self, "observation", kind if self.start is None else start_observation(self.start, self.observation)
+        )
         _ = self.settings, self.preset
 
     @property
@@ -96,7 +110,7 @@ class Train:
     @property
     def preset(self) -> PPOPreset:
         """PPO's settings; the buffer is shared by as many agents as asked for."""
-        preset = PRESETS.get(self.observation, MAP)
+        preset = PRESETS.get(str(self.observation), MAP)
         buffer = preset.n_envs * preset.n_steps
         agents = preset.n_envs if self.agents is None else self.agents
         if agents < 1 or buffer % agents:
@@ -132,12 +146,15 @@ def _environment(options: Train) -> Any:
 
 
 def _model(options: Train, env: Any) -> Any:
+    arguments = {"seed": options.seed, **options.preset.arguments()}
+    if options.start is not None:
+        return started_ppo(options.start, env, **arguments)
     if options.resume is None:
         from gymnasium import spaces
         from stable_baselines3 import PPO
 
         policy = "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy"
-        return PPO(policy, env, device="cpu", seed=options.seed, **options.preset.arguments())
+        return PPO(policy, env, device="cpu", **arguments)
     with tempfile.TemporaryDirectory() as folder:
         path = _resumed_file(options.resume, folder)
         if (statistics := statistics_of(path)) is not None:
@@ -212,6 +229,7 @@ def main(options: Train) -> None:
     torch.set_num_threads(1)
     env = _environment(options)
     model = _model(options, env)
+    note_training(model, options.settings, options.scene)
     tracking = MLflowCallback(options.experiment, run_name=options.run_name)
     callbacks = _callbacks(options, tracking)
     begun = model.num_timesteps

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from avp_habitat import plugins
 from avp_habitat.errors import PolicyError, UsageError
 from avp_habitat.policies.saved_model import ALGORITHMS, NormalisedPolicy, load_model, statistics_of
+from avp_habitat.policies.weights import PRETRAINED, weights_file
+from avp_habitat.policies.weights.format import read_facts, read_weights
+from avp_habitat.policies.weights.policy import PretrainedPolicy
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.settings import OBSERVATIONS, TaskSettings
@@ -33,6 +36,7 @@ class Policy(Protocol):
 
 
 POLICIES = {
+    PRETRAINED: "avp_habitat.policies.weights.policy:PretrainedPolicy.for_env",
     "heuristic": "avp_habitat.policies.reactive:HeuristicPolicy.for_env",
     "random": "avp_habitat.policies.reactive:RandomPolicy.for_env",
     "spin": "avp_habitat.policies.reactive:SpinPolicy.for_env",
@@ -41,8 +45,10 @@ POLICIES = {
     "oracle": "avp_habitat.policies.oracle.policy:OraclePolicy.for_env",
     "survey": "avp_habitat.policies.oracle.policy:SurveyPolicy.for_env",
 }
-"""The baselines by name: each is a function of (env, seed) that gives a `Policy`."""
-POLICIES_HELP = f"{', '.join(POLICIES)}, MODULE:OBJECT, or a model (.zip)"
+"""By name the package's weights and the baselines: each is a function of (env, seed) that gives a `Policy`."""
+POLICIES_HELP = (
+    f"{', '.join(POLICIES)}, {PRETRAINED}:NAME, MODULE:OBJECT, an exported policy's folder, or a model (.zip)"
+)
 """Help of the option `--policy`."""
 TRUSTED = "open a model also where that may run code which its file holds: only if you know who made it"
 """Help of the option `--trusted`."""
@@ -53,12 +59,15 @@ def check_policy(policy: Any) -> Any:
 
     Raises:
         UsageError: no such name, object or file; the text names the nearest name.
-        PolicyError: a model was trained under `VecNormalize`, and its statistics are not beside it.
+        PolicyError: a model was trained under `VecNormalize`, and its statistics are not beside it; or the files of an
+            exported policy cannot be used.
     """
-    file = _model_file(policy)
-    if file is None:
+    file, weights = _model_file(policy), exported_file(policy)
+    if weights is not None:
+        read_weights(weights)
+    elif file is None:
         if policy not in POLICIES:  # Those are imported by who makes one.
-            plugins.find("avp.policies", policy, POLICIES | {"MODEL.zip": ""})
+            plugins.find("avp.policies", policy, POLICIES | {"MODEL.zip": "", "FOLDER": ""})
     elif not file[0].is_file():
         raise UsageError(f"--policy {policy}: no such model file")
     else:
@@ -67,8 +76,11 @@ def check_policy(policy: Any) -> Any:
 
 
 def described(policy: Any) -> str:
-    """A policy as it will act, for the screen: with the statistics by which a model sees."""
+    """A policy as it will act, for the screen: with the statistics by which a model sees, or its weights' version."""
     file, name = _model_file(policy), plugins.name_of(policy)
+    if (weights := exported_file(policy)) is not None:
+        facts = read_facts(weights)
+        return f"{name} ({facts['name']}, version {facts['version']})"
     statistics = None if file is None else statistics_of(file[0])
     return name if statistics is None else f"{name} with the statistics {statistics}"
 
@@ -81,6 +93,15 @@ def _model_file(policy: Any) -> tuple[Path, str | None] | None:
     return (Path(path), algorithm) if algorithm in ALGORITHMS else (Path(policy), None)
 
 
+def exported_file(policy: Any) -> Path | None:
+    """The `.json` of a policy that is the package's or an exported one; None for every other policy.
+
+    Errors are those of `weights.weights_file`.
+    """
+    others = [name for name in plugins.names("avp.policies", POLICIES) if name != PRETRAINED]
+    return None if policy in others else weights_file(policy)
+
+
 def make_policy(policy: Any, env: AVPEnv, seed: int, *, trusted: bool = False) -> Policy:
     """The policy for an environment.
 
@@ -89,7 +110,8 @@ def make_policy(policy: Any, env: AVPEnv, seed: int, *, trusted: bool = False) -
             something with `predict`, or a class or function of (env, seed) that gives such a thing; what planners know
             about the agents is `agent_view.agent_views(env)`. Or a model saved by Stable-Baselines3 or sb3-contrib,
             `MODEL.zip`, or `ALGORITHM:MODEL.zip` where the file does not tell. One that was trained under
-            `VecNormalize` sees observations normalised with the statistics beside it.
+            `VecNormalize` sees observations normalised with the statistics beside it. Or weights: `pretrained`,
+            `pretrained:NAME`, the folder of a policy that `python -m avp_sb3.export` wrote, or the `.json` in it.
         env: what it acts in.
         seed: of a policy that draws at random.
         trusted: open a model's file also where that may run code which the file holds.
@@ -99,6 +121,9 @@ def make_policy(policy: Any, env: AVPEnv, seed: int, *, trusted: bool = False) -
         MisfitError: the model was trained for other observations or actions.
         PolicyError: the file is no such model, holds what may run code, or lacks its statistics.
     """
+    weights = exported_file(policy)
+    if weights is not None:
+        return _of_weights(policy, weights, env, seed)
     check_policy(policy)
     file = _model_file(policy)
     if file is None:
@@ -112,6 +137,18 @@ def make_policy(policy: Any, env: AVPEnv, seed: int, *, trusted: bool = False) -
     model.set_random_seed(seed)
     statistics = statistics_of(path)
     return model if statistics is None else NormalisedPolicy(model, statistics, trusted=trusted)
+
+
+def _of_weights(policy: str, path: Path, env: AVPEnv, seed: int) -> Policy:
+    weights = read_weights(path)
+    kind, shape = plugins.name_of(env.settings.observation), env.observation_space.shape
+    if (kind, shape) != (weights.observation, weights.shape):
+        made = f"{weights.observation!r} of shape {weights.shape}"
+        raise MisfitError(f"{policy}: made for the observation {made}, but this environment has {kind!r} of {shape}")
+    actions = len(weights.actor[-1].bias)
+    if (offered := getattr(env.action_space, "n", None)) != actions:
+        raise MisfitError(f"{policy}: made for {actions} actions, but this environment has {offered}")
+    return PretrainedPolicy(weights, seed)
 
 
 def _made(policy: Any, found: Any, env: AVPEnv, seed: int) -> Policy:
@@ -140,14 +177,17 @@ def make_policy_env(
     """An environment, and the policy that acts in it; arguments that both have are those of `make_policy`.
 
     Without a kind of observation it is the first one that fits, of the settings' own, those that are built in and those
-    that other distributions register: a baseline fits each, a model its own.
+    that other distributions register: a baseline fits each, a model its own. Weights name theirs; where that is
+    `module:object`, it has to be given, so that no file chooses what is imported.
 
     Raises:
         UsageError: no such policy or observation.
         PolicyError: the model cannot be loaded, or fits no kind of observation.
     """
-    kinds = [observation]
-    if observation is None:
+    kinds, weights = [observation], exported_file(policy)
+    if observation is None and weights is not None:
+        kinds = [observation_of(weights)]
+    elif observation is None:
         kinds = [settings.observation, *plugins.names("avp.observations", OBSERVATIONS)]
     misfits: list[MisfitError] = []
     for kind in kinds:
@@ -157,6 +197,18 @@ def make_policy_env(
         except MisfitError as error:
             misfits.append(error)
     raise misfits[0]
+
+
+def observation_of(weights: Path) -> str:
+    """The kind of observation that a policy's `.json` names.
+
+    Raises:
+        PolicyError: it names an object of a module, which only the user may choose.
+    """
+    kind = str(read_facts(weights)["observation"]["kind"])
+    if ":" in kind:
+        raise PolicyError(f"{weights}: made for the observation {kind}, a program's own; give --observation {kind}")
+    return kind
 
 
 @dataclass(frozen=True)

@@ -147,7 +147,7 @@ class _KnownObjects(pickle.Unpickler):
             return type(name, (_NumpyType if (module, name) == ("numpy", "dtype") else _Nothing,), {})
         raise PolicyError(
             f"{self._path}: opening it would run code that it holds or names, found {module}.{name}; if you know "
-            "who made it, open it with --trusted"
+            "who made it, open it with --trusted, or once and for all: python -m avp_sb3.export --trusted"
         )
 
 

@@ -1,0 +1,1 @@
+"""Policies between Stable-Baselines3, the files of `avp_habitat.policies.weights`, and ONNX."""
