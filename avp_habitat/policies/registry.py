@@ -40,6 +40,7 @@ POLICIES = {
     "greedy": "avp_habitat.policies.greedy:GreedyPolicy.for_env",
     "oracle": "avp_habitat.policies.oracle.policy:OraclePolicy.for_env",
     "survey": "avp_habitat.policies.oracle.policy:SurveyPolicy.for_env",
+    "survey-multiview": "avp_habitat.policies.oracle.policy:MultiviewSurveyPolicy.for_env",
 }
 """The baselines by name: each is a function of (env, seed) that gives a `Policy`."""
 POLICIES_HELP = f"{', '.join(POLICIES)}, MODULE:OBJECT, or a model (.zip)"
