@@ -31,7 +31,8 @@ AUTO, NONE = "auto", "none"
 EXPERIMENT, KIND = "avp-experiment", "experiment"
 """MLflow experiment outside of `mlflow run` where `MLFLOW_EXPERIMENT_NAME` names none; value of `avp.kind`."""
 _ARTIFACTS = ("*.md", "*.csv", "*.png", "results.json", "experiment.json")
-_SHOWN = ("views", "coverage", "annd_m", "ei", "path_length_m", "visibility", "collisions", "stopped")
+_SEEN = ("visibility", "visibility_parallax")
+_SHOWN = ("views", "coverage", "annd_m", "ei", "path_length_m", *_SEEN, "collisions", "stopped")
 _METHODS = f"with commas between: policies, rewards, rewards with {ROOMS}, module:object; auto: {', '.join(DEFAULT)}"
 
 

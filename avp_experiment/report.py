@@ -27,7 +27,7 @@ _TABLES = {
     "table3": (UNSEEN, "Table 3: unseen scenes, no retraining"),
 }
 SCORES = ("psnr", "ssim", "lpips")
-COLUMNS = ("views", "coverage", "annd_m", "ei", "path_length_m", "visibility", *SCORES)
+COLUMNS = ("views", "coverage", "annd_m", "ei", "path_length_m", "visibility", "visibility_parallax", *SCORES)
 """The suite's figures that the tables show; those that users added follow."""
 Rows = Mapping[str, Mapping[str, Summary | None]]
 _SETTINGS = ("seeds", "starts", "budget", "observation", "steps", "steps_rooms", "width", "height", "reconstruction",

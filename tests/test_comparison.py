@@ -74,14 +74,14 @@ def test_the_table_holds_means_and_students_intervals_by_scene_policy_and_method
 
 def test_a_rollout_counts_once_beside_its_reconstruction(store):
     found, room = store.create_experiment("avp"), {"scene": "room.glb", "policy": "a"}
-    figures = {"coverage": 0.9, "views": 40, "visibility": 0.625}
+    figures = {"coverage": 0.9, "views": 40, "visibility": 0.625, "visibility_parallax": 0.5}
     rollout = make_run(store, found, figures, kind="rollout", **room)
     make_run(store, found, {**figures, "psnr": 24.0}, kind="reconstruction", method="nerf", rollout_run=rollout, **room)
     make_run(store, found, {"coverage": 0.4, "views": 20}, kind="rollout", **room)
     rows = parsed(markdown(compare(store, found)))
-    assert [(row["method"], row["runs"], row["views"], row["visibility [%]"]) for row in rows] == [
-        ("nerf", "1", "40.0", "62.5"),
-        ("rollout", "1", "20.0", "–"),
+    assert [(row["method"], row["runs"], row["views"], row["visibility [%]"], row["parallax [%]"]) for row in rows] == [
+        ("nerf", "1", "40.0", "62.5", "50.0"),
+        ("rollout", "1", "20.0", "–", "–"),
     ]
 
 

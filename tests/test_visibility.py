@@ -195,6 +195,7 @@ def test_frames_rays_and_distances_are_counted():
     assert answer() == (0, False, False, 0.0)
     assert answer(ahead) == (1, True, False, 1.0)
     assert answer(ahead, ahead, closer) == (3, True, False, 1.0)
+    assert visibility(points, [ahead, ahead, more, more], CAMERA).curve(parallax=True).tolist() == [0, 0, 1, 1]
     assert answer(closer) == (1, True, False, 1.0)
     assert answer(far) == (1, False, False, 0.444)
     assert answer(aside) == (1, False, False, 0.0)

@@ -44,6 +44,7 @@ POLICIES = {
     "greedy": "avp_habitat.policies.greedy:GreedyPolicy.for_env",
     "oracle": "avp_habitat.policies.oracle.policy:OraclePolicy.for_env",
     "survey": "avp_habitat.policies.oracle.policy:SurveyPolicy.for_env",
+    "survey-multiview": "avp_habitat.policies.oracle.policy:MultiviewSurveyPolicy.for_env",
 }
 """By name the package's weights and the baselines: each is a function of (env, seed) that gives a `Policy`."""
 POLICIES_HELP = (

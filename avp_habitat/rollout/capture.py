@@ -121,7 +121,8 @@ def publish_rollout(
         mlflow_run_id: of the training that the policy comes from.
 
     Returns:
-        The metrics of `rollout.json`, those of the episode and `visibility` where held-out views show a surface.
+        The metrics of `rollout.json`: those of the episode, and where held-out views show a surface `visibility` and
+        `visibility_parallax`.
     """
     write_rgb(writer.path("trajectory.png"), draw_trajectory(env.area, info["avp_trajectory"]))
     floor = _write_floor(env.area, info["avp_trajectory"], writer)
@@ -129,7 +130,7 @@ def publish_rollout(
     rollout = Rollout(writer.path(""), _scene_and_task(env, heldout), writer.intrinsics, frames, views)
     # From the files, in whole millimetres, so that the figure is the one that a reader of the folder computes.
     seen = visibility_of(frames, views, writer.intrinsics).figures() if views else {}
-    visibility = {"visibility": seen["visibility"]} if "visibility" in seen else {}
+    visibility = {name: seen[name] for name in ("visibility", "visibility_parallax") if name in seen}
     metrics = info["avp_episode"] | visibility | measured(env.settings.metrics, "rollout", rollout)
     about = {"policy": policy, "seed": seed, "metrics": metrics, "floor": floor, "mlflow_run_id": mlflow_run_id}
     writer.publish(rollout.meta | about)

@@ -64,8 +64,14 @@ class Visibility:
     """`(m,)` within [0, 1]: the greatest cos(turn of the ray) · min(1, held-out distance / frame's distance)."""
     alike: NDArray[np.bool_]
     """`(m,)` whether a frame saw it from within `ALIKE_DEG` and `ALIKE_DISTANCE` times the distance."""
-    parallax: NDArray[np.bool_]
-    """`(m,)` whether a frame saw it along a ray `PARALLAX_DEG` or more from that of the first frame that did."""
+    aside: NDArray[np.int64]
+    """`(m,)` index of the first frame that saw it along a ray `PARALLAX_DEG` or more from that of the first frame that
+    did; `frames` where none did."""
+
+    @property
+    def parallax(self) -> NDArray[np.bool_]:
+        """`(m,)` whether a frame saw it along a ray `PARALLAX_DEG` or more from that of the first frame that did."""
+        return self.aside < self.frames
 
     def figures(self) -> dict[str, float]:
         """Shares of the tested pixels, within [0, 1]; no figure at all when no pixel shows a surface.
@@ -90,9 +96,12 @@ class Visibility:
         seen = np.bincount(self.view, self.count >= 1, minlength=self.views)
         return np.divide(seen, tested, out=np.full(self.views, np.nan), where=tested > 0)
 
-    def curve(self) -> NDArray[np.float64]:
-        """`(frames,)` share of the tested pixels seen by the first 1, 2, 3, … frames; NaN without tested pixels."""
-        new = np.bincount(self.first, minlength=self.frames + 1)[: self.frames]
+    def curve(self, *, parallax: bool = False) -> NDArray[np.float64]:
+        """`(frames,)` share of the tested pixels seen by the first 1, 2, 3, … frames; NaN without tested pixels.
+
+        With `parallax`, the share that they have seen along two rays `PARALLAX_DEG` or more apart.
+        """
+        new = np.bincount(self.aside if parallax else self.first, minlength=self.frames + 1)[: self.frames]
         return np.cumsum(new) / len(self.view) if len(self.view) else np.full(self.frames, np.nan)
 
 
@@ -149,7 +158,8 @@ def visibility(points: HeldoutPoints, frames: Iterable[DepthView], intrinsics: I
     """Look for the surfaces of held-out pixels in captured frames, in the order of capture, one in memory at a time."""
     total, number = len(points.xyz), 0
     count, first = np.zeros(total, np.int64), np.zeros(total, np.int64)
-    likeness, alike, parallax = np.zeros(total), np.zeros(total, bool), np.zeros(total, bool)
+    likeness, alike = np.zeros(total), np.zeros(total, bool)
+    aside = np.full(total, np.iinfo(np.int64).max)
     wanted, wanted_m = _rays(points.xyz, points.eyes[points.view])
     first_ray = np.zeros((total, 3))
     for number, (depth, pose) in enumerate(frames, start=1):
@@ -161,9 +171,10 @@ def visibility(points: HeldoutPoints, frames: Iterable[DepthView], intrinsics: I
         cosine, ratio = _cosine(ray, wanted[seen]), distance_m / wanted_m[seen]
         likeness[seen] = np.maximum(likeness[seen], cosine / np.maximum(ratio, 1.0))
         alike[seen] |= (cosine >= np.cos(np.radians(ALIKE_DEG))) & (ratio <= ALIKE_DISTANCE)
-        parallax[seen] |= _cosine(ray, first_ray[seen]) <= np.cos(np.radians(PARALLAX_DEG))
+        apart = seen[_cosine(ray, first_ray[seen]) <= np.cos(np.radians(PARALLAX_DEG))]
+        aside[apart] = np.minimum(aside[apart], number - 1)
     first[count == 0] = number
-    return Visibility(points.view, len(points.eyes), number, first, count, likeness, alike, parallax)
+    return Visibility(points.view, len(points.eyes), number, first, count, likeness, alike, np.minimum(aside, number))
 
 
 def _rays(points: Float, eyes: Float) -> tuple[Float, Float]:

@@ -35,12 +35,13 @@ if TYPE_CHECKING:
     from mlflow.entities import Experiment
 
 TABLE, MARKDOWN, PICTURE = "comparison.json", "comparison.md", "comparison.png"
-_ALWAYS = [FIGURES[name] for name in ("views", "coverage", "cpv", "visibility", "psnr", "ssim", "lpips")]
+_SEEN = ("visibility", "visibility_parallax")
+_ALWAYS = [FIGURES[name] for name in ("views", "coverage", "cpv", *_SEEN, "psnr", "ssim", "lpips")]
 _MOST_RUNS = 50_000  # that MLflow gives in one answer
 _HOW_TO_READ = f"""
 More PSNR and SSIM are better, less LPIPS; fewer views are better. Means over the runs; ± is half of the 95 % interval.
 
-{explained("coverage", "CpV", "visibility", "PSNR", "SSIM", "LPIPS")}.
+{explained("coverage", "CpV", "visibility", "parallax", "PSNR", "SSIM", "LPIPS")}.
 """
 
 

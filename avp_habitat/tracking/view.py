@@ -15,7 +15,7 @@ from avp_habitat.tracking.names import NOTE_TAG, PAGE_TAG, VIEW_TAG, VIEWS_TAG
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-VERSION = "1"
+VERSION = "2"
 """Of the tag `avp.views`; with it, what people change or delete on the page stays as they left it."""
 MODEL_TRAINING = "workflowType=machine_learning"
 """Parameter of an address: MLflow 3.17 shows pages of traces first to a browser that has never been there."""
@@ -106,7 +106,7 @@ def _column(name: str) -> str:
     return f"{kind}.`{name}`"
 
 
-_COMPARED = "eval/psnr eval/views eval/coverage eval/visibility eval/ssim eval/lpips"
+_COMPARED = "eval/psnr eval/views eval/coverage eval/visibility eval/visibility_parallax eval/ssim eval/lpips"
 _COURSE = "avp/coverage avp/views avp/cpv rollout/ep_rew_mean avp/stop_share avp/redundant_views"
 RECONSTRUCTIONS = RunsView(
     key="avp-reconstructions",
@@ -175,7 +175,8 @@ def prepare_experiment(client: "MlflowClient", experiment_id: str) -> None:
         _LOG.warning("MLflow experiment %s: its page could not be prepared: %s", experiment_id, error)
 
 
-_EXPLAINED = ("views", "coverage", "cpv", "ei", "annd_m", "redundant_views", "visibility", "psnr", "ssim", "lpips")
+_EXPLAINED = ("views", "coverage", "cpv", "ei", "annd_m", "redundant_views")
+_EXPLAINED += ("visibility", "visibility_parallax", "psnr", "ssim", "lpips")
 
 
 def _explained(figure: Figure) -> str:

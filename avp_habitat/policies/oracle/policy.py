@@ -1,19 +1,25 @@
-"""`oracle` and `survey`: they plan a whole episode when it starts, then play the plan."""
+"""`oracle`, `survey` and `survey-multiview`: they plan a whole episode when it starts, then play the plan."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.errors import UsageError
+from avp_habitat.policies.oracle.multiview import plan_second_looks
 from avp_habitat.policies.oracle.places import scene_places
 from avp_habitat.policies.oracle.search import beam_search, covering_tour, start_state
 from avp_habitat.policies.planning import PlanningPolicy
 from avp_habitat.sight.rules import candidates
 from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.motion import act, sensor_poses
+
+Objective = Literal["floor", "surface", "multiview"]
+"""What a plan is for: seeing all floor, all surfaces, or all surfaces twice, from directions 10° apart."""
+_NAMES = {"floor": "oracle", "surface": "survey", "multiview": "survey-multiview"}
 
 
 @dataclass(frozen=True)
@@ -26,26 +32,31 @@ class Plan:
     """`(T,)` coverage C after each view (Eq. 17)."""
 
 
-def make_plan(view: AgentView, *, surfaces: bool = False, width: int | None = None) -> Plan:
+def make_plan(view: AgentView, *, objective: Objective = "floor", width: int | None = None) -> Plan:
     """Plan the rest of an agent's episode with full knowledge of the scene.
 
     Two plans are made, by the tour of a greedy set cover and by a beam search over action sequences, and the one with
-    the larger mean coverage over its views is returned. With `surfaces`, the search alone plans to see every surface,
-    not the floor alone; surfaces other than the floor count as not yet seen.
+    the larger mean coverage over its views is returned. For the objective `surface` the search alone plans to see every
+    surface, not the floor alone; surfaces other than the floor count as not yet seen. For `multiview` it plans to see
+    each twice, along rays 10° apart (`multiview.plan_second_looks`), and all count as not yet seen.
 
     Raises:
         UsageError: the task does not count visible cells.
     """
     settings = view.settings
     if settings.coverage_mode != "visible":
-        name = "survey" if surfaces else "oracle"
         raise UsageError(
-            f"policy {name}: plans for coverage_mode 'visible', got {settings.coverage_mode!r}; choose another policy"
+            f"policy {_NAMES[objective]}: plans for coverage_mode 'visible', got {settings.coverage_mode!r}; choose "
+            "another policy"
         )
-    places = scene_places(view.simulator, settings, surfaces=surfaces)
-    start, views = start_state(view, len(places.points)), settings.budget - view.steps
-    found = [] if surfaces else [covering_tour(places, settings, start, views)]
-    found.append(beam_search(places, settings, start, views, width or (300 if surfaces else 1000)))
+    views, sparse = settings.budget - view.steps, objective == "multiview"
+    places = scene_places(view.simulator, settings, surfaces=objective != "floor", sparse=sparse)
+    if objective == "multiview":
+        found = [plan_second_looks(places, view, views, width or 300)]
+    else:
+        start = start_state(view, len(places.points))
+        found = [covering_tour(places, settings, start, views)] if objective == "floor" else []
+        found.append(beam_search(places, settings, start, views, width or (1000 if objective == "floor" else 300)))
     plans = [Plan(actions, planned_coverage(view, actions)) for actions in found]
     return max(plans, key=lambda plan: plan.coverage.sum())
 
@@ -93,7 +104,7 @@ class OraclePolicy(PlanningPolicy):
     It prepares each scene once and then plans for each episode; it never stops before the budget ends.
     """
 
-    surfaces = False
+    objective: Objective = "floor"
 
     def __init__(
         self, views: Callable[[], list[AgentView]], seed: int | None = None, *, width: int | None = None
@@ -104,10 +115,16 @@ class OraclePolicy(PlanningPolicy):
 
     def make_planner(self, rng: np.random.Generator) -> OraclePlanner:
         """For one episode; nothing is drawn at random."""
-        return OraclePlanner(partial(make_plan, surfaces=self.surfaces, width=self.width))
+        return OraclePlanner(partial(make_plan, objective=self.objective, width=self.width))
 
 
 class SurveyPolicy(OraclePolicy):
     """`survey`: the oracle for reconstruction, which plans to see every surface of the scene, not the floor alone."""
 
-    surfaces = True
+    objective = "surface"
+
+
+class MultiviewSurveyPolicy(OraclePolicy):
+    """`survey-multiview`: the survey that also plans a second look at every surface, from another direction."""
+
+    objective = "multiview"

@@ -71,7 +71,11 @@ def beam_search(
     for left in range(views - 1, -1, -1):
         states, parent, action = _advance(places, settings, states, left, width)
         history.append((parent, action))
-    row = int(np.argmax(states.value))
+    return back_from(int(np.argmax(states.value)), history)
+
+
+def back_from(row: int, history: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> NDArray[np.int64]:
+    """The actions that lead to a row of the last states, by each step's parents and actions."""
     actions = []
     for parent, action in reversed(history):
         actions.append(action[row])
@@ -79,34 +83,62 @@ def beam_search(
     return np.array(actions[::-1], dtype=np.int64)
 
 
+@dataclass(frozen=True)
+class Moves:
+    """c candidates: what k states can do next, and where that leads; every array's first axis is c."""
+
+    parent: NDArray[np.int64]
+    """`(c,)` rows of the states."""
+    action: NDArray[np.int64]
+    """`(c,)` numbers of `settings.ACTION_NAMES`; never stop."""
+    position: Float
+    """`(c, 3)` feet, metres."""
+    yaw: Float
+    """`(c,)` radians."""
+    pitch: Float
+    """`(c,)` radians."""
+    place: NDArray[np.int64]
+    """`(c,)` numbers of the nearest places."""
+    heading: NDArray[np.uint8]
+    """`(c,)` the yaw in 256ths of a turn."""
+    key: NDArray[np.int64]
+    """`(c,)` alike for candidates that stand and look alike."""
+
+
+def all_moves(places: ScenePlaces, settings: TaskSettings, position: Float, yaw: Float, pitch: Float) -> Moves:
+    """Every useful action of k agents: `(k, 3)` feet in metres, `(k,)` angles in radians."""
+    n = len(yaw)
+    parent, action = np.tile(np.arange(n), len(_MOVES)), np.repeat(_MOVES, n)
+    limit, before = np.radians(settings.pitch_limit_deg) - 1e-9, pitch[parent]
+    useful = ~(((action == LOOK_UP) & (before >= limit)) | ((action == LOOK_DOWN) & (before <= -limit)))
+    parent, action = parent[useful], action[useful]
+    position, yaw, pitch = act(places.area, settings, action, position[parent], yaw[parent], pitch[parent])
+    place = places.nearest(position)
+    heading = (np.round(yaw / (2 * np.pi) * 256).astype(np.int64) & 255).astype(np.uint8)
+    turn = np.round(wrap_angle(yaw) / np.radians(settings.turn_deg)).astype(np.int64)
+    tilt = np.round(pitch / np.radians(settings.tilt_deg)).astype(np.int64)
+    key = 1 + (place * 4096 + turn + 2048) * 4096 + tilt + 2048
+    return Moves(parent, action, position, yaw, pitch, place, heading, key)
+
+
 def _advance(
     places: ScenePlaces, settings: TaskSettings, states: States, left: int, width: int
 ) -> tuple[States, NDArray[np.int64], NDArray[np.int64]]:
     """The states after one more view, the rows that they come from, and the actions that lead to them."""
-    n = len(states.value)
-    parent, action = np.tile(np.arange(n), len(_MOVES)), np.repeat(_MOVES, n)
-    limit, before = np.radians(settings.pitch_limit_deg) - 1e-9, states.pitch[parent]
-    useful = ~(((action == LOOK_UP) & (before >= limit)) | ((action == LOOK_DOWN) & (before <= -limit)))
-    parent, action = parent[useful], action[useful]
-    moved = states.position[parent], states.yaw[parent], states.pitch[parent]
-    position, yaw, pitch = act(places.area, settings, action, *moved)
-    place = places.nearest(position)
+    moves = all_moves(places, settings, states.position, states.yaw, states.pitch)
+    parent, position, yaw, pitch = moves.parent, moves.position, moves.yaw, moves.pitch
     fresh, gain = new_views(places, settings, parent, position, yaw, pitch, states.seen)
     value = states.value[parent] + (left + 1) * gain
-    heading = (np.round(yaw / (2 * np.pi) * 256).astype(np.int64) & 255).astype(np.uint8)
     seen = states.seen[parent] | fresh
+    unseen = places.wanted & ~seen
     hope = kernels.outlook(
-        place, heading, places.wanted & ~seen, places.reach, places.heading, *_turning(settings), left, PACE
+        moves.place, moves.heading, unseen, places.reach, places.heading, *turning(settings), left, PACE
     )
-    turn = np.round(wrap_angle(yaw) / np.radians(settings.turn_deg)).astype(np.int64)
-    tilt = np.round(pitch / np.radians(settings.tilt_deg)).astype(np.int64)
-    key = 1 + (place * 4096 + turn + 2048) * 4096 + tilt + 2048
-    order = np.argsort(-(value + hope), kind="stable")
-    kept = kernels.choose(order, key, seen, width, PER_KEY)
-    return States(position[kept], yaw[kept], pitch[kept], seen[kept], value[kept]), parent[kept], action[kept]
+    kept = kernels.choose(np.argsort(-(value + hope), kind="stable"), moves.key, seen, width, PER_KEY)
+    return States(position[kept], yaw[kept], pitch[kept], seen[kept], value[kept]), parent[kept], moves.action[kept]
 
 
-def _turning(settings: TaskSettings) -> tuple[Float, Float]:
+def turning(settings: TaskSettings) -> tuple[Float, Float]:
     """`(256,)` steps of turning for each difference of heading: until a cell is in the image, and until it is ahead."""
     apart = np.abs((np.arange(256) + 128) % 256 - 128) * 360 / 256
     near = np.maximum(apart - settings.hfov_deg / 2, 0) / settings.turn_deg
