@@ -28,13 +28,18 @@ class PPOPreset:
     """Of the advantage estimate."""
     gamma: float = 0.99
     """Discount per step."""
+    net_arch: tuple[int, ...] = (64, 64)
+    """Units of the layers of the policy's network, and of the value's; these are SB3's own."""
+    stop_logit: float = 0.0
+    """Of the action stop before the training: below 0, first episodes are long where stop ends them at any time."""
 
     def arguments(self) -> dict[str, Any]:
         """The keyword arguments of `stable_baselines3.PPO` but the number of agents."""
         from stable_baselines3.common.utils import LinearSchedule
 
         arguments = asdict(self)
-        del arguments["n_envs"]
+        del arguments["n_envs"], arguments["stop_logit"]
+        arguments["policy_kwargs"] = {"net_arch": list(arguments.pop("net_arch"))}
         if arguments.pop("linear"):
             arguments["learning_rate"] = LinearSchedule(self.learning_rate, 0.0, 1.0)
         return arguments
@@ -42,6 +47,8 @@ class PPOPreset:
     def zoo(self) -> dict[str, Any]:
         """The same as rl_zoo3 writes it."""
         settings = asdict(self)
+        del settings["stop_logit"]
+        settings["policy_kwargs"] = {"net_arch": list(settings.pop("net_arch"))}
         if settings.pop("linear"):
             settings["learning_rate"] = f"lin_{self.learning_rate:g}"
         return settings
@@ -51,5 +58,17 @@ TABLE_4 = PPOPreset(n_envs=64, n_steps=32, batch_size=512, n_epochs=10, learning
 """Table 4 of the paper: a buffer of 2048 steps, here of 64 agents."""
 MAP = PPOPreset(n_envs=64, n_steps=128, batch_size=1024, n_epochs=6, learning_rate=5e-4, linear=True, ent_coef=0.01)
 """For the map: a larger buffer and fewer passes; chosen after a few trials on white_room (docs/training.md)."""
-PRESETS = {"numbers": TABLE_4, "map": MAP, "surface_map": MAP}
+ONBOARD = PPOPreset(
+    n_envs=128,
+    n_steps=64,
+    batch_size=2048,
+    n_epochs=4,
+    learning_rate=5e-4,
+    linear=True,
+    ent_coef=0.01,
+    net_arch=(128, 64),
+    stop_logit=-5.0,
+)
+"""For what a robot knows; of many scenes, in which many agents of a scene share the cost of a call."""
+PRESETS = {"numbers": TABLE_4, "map": MAP, "surface_map": MAP, "onboard": ONBOARD, "privileged": ONBOARD}
 """By kind of observation."""

@@ -27,7 +27,7 @@ class RewardConstants:
     """α of `proposed`: reward per (newly observed cell)^β."""
     alpha_surface: Amount = 0.0045
     """α of `surface`: reward per (newly seen surface point)^β, each weighted by how well it is seen (`surfaces`)."""
-    alpha_multiview: Amount = 0.009
+    alpha_multiview: Amount = 0.02
     """α_m of `multiview`: reward per (growth of Q and S, by their weights)^β."""
     single_weight: Annotated[float, Range(0, 1)] = 0.5
     """w of `multiview`: weight of how well points are seen in one view (Q); 1 - w is that of two views (S)."""
