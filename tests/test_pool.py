@@ -3,6 +3,7 @@ import weakref
 
 import numpy as np
 import pytest
+from corridor import Corridor
 from mlflow import MlflowClient
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
@@ -82,15 +83,13 @@ def test_agents_that_end_at_different_times_enter_one_by_one():
     env = pool(turnover=2)
     env.reset()
     env._task.steps[:] = [0, 1, 2, 3]
-    before = env.get_attr("scene_name")
-    seen = set()
+    before, moved = env.get_attr("scene_name"), set()
     for _ in range(30):
         env.step(np.ones(4, dtype=int))
         now = env.get_attr("scene_name")
-        seen.add(sum(a != b for a, b in zip(before, now, strict=True)))
+        moved.add(sum(a != b for a, b in zip(before, now, strict=True)))
         before = now
-        assert env.observation_space.contains(env._task.step(np.ones(4, dtype=int)).observation[0]) or True
-    assert seen == {0, 1}
+    assert moved == {0, 1}
 
 
 def test_the_seed_decides_scenes_and_starts():
@@ -101,23 +100,15 @@ def test_the_seed_decides_scenes_and_starts():
 
 
 def test_a_scene_that_was_left_is_freed():
-    class Room:
-        """A door to a real simulator that can be watched."""
-
-        def __init__(self, scene):
-            self._real = make_simulator("raycast", scene)
-
-        def __getattr__(self, name):
-            return getattr(self._real, name)
-
     made = []
 
     def factory(scene):
-        room = Room(scene)
+        room = Corridor()
+        room.scene = scene
         made.append(weakref.ref(room))
         return room
 
-    env = pool(simulator=factory, settings=TaskSettings(width=16, height=12, budget=BUDGET))
+    env = pool([f"corridor {number}" for number in range(5)], simulator=factory)
     walk(env, 60)
     gc.collect()
     assert len(made) > 5
@@ -126,10 +117,9 @@ def test_a_scene_that_was_left_is_freed():
 
 def test_a_scene_that_cannot_be_used_is_left_out_with_a_warning():
     with pytest.warns(UserWarning, match=r"no\.glb.*goes on without this scene"):
-        env = pool([*ROOMS[:3], "no.glb"])
-        scenes = walk(env, 40)[1]
-    assert set(sum(scenes, [])) == set(ROOMS[:3])
-    with pytest.raises(SceneError, match="no.glb"), pytest.warns(UserWarning):
+        scenes = walk(pool([*ROOMS[:3], "no.glb"]), 40)[1]
+    assert {name for now in scenes for name in now} == set(ROOMS[:3])
+    with pytest.raises(SceneError, match=r"no(ne)?\.glb"), pytest.warns(UserWarning, match=".glb"):
         pool(["no.glb", "none.glb"], open_scenes=1)
 
 
@@ -154,7 +144,7 @@ def test_many_scenes_are_called_by_their_kinds():
     assert Train().scenes == ["builtin:0"]
 
 
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_training_in_a_pool_with_all_callbacks(tmp_path, monkeypatch, workers):
     home = mlflow_home(tmp_path, monkeypatch)
     scenes = [f"builtin:{seed}" for seed in (0, 1, 2, 3, 0, 1)]
