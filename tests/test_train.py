@@ -112,6 +112,17 @@ def test_a_scene_that_cannot_be_evaluated_ends_before_a_run_or_a_model_is_made(r
 
 
 @pytest.mark.slow
+def test_the_training_script_trains_in_a_pool_of_generated_rooms(tmp_path):
+    words = ("--steps", 2048, "--agents", 16, "--rooms", 3, "--open-scenes", 2, "--turnover", 1, "--out", "m.zip")
+    done = run(*words, "--width", 16, "--height", 12, "--recording", "r.rrd", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    client = MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    (found,) = client.search_runs([client.get_experiment_by_name("avp").experiment_id])
+    assert found.data.tags["avp.scene"] == "builtin:1000, builtin:1001, builtin:1002"
+    assert found.info.status == "FINISHED"
+
+
+@pytest.mark.slow
 def test_the_training_script_trains_with_a_process_for_each_scene(tmp_path):
     words = ("--steps", 2048, "--agents", 16, "--scene", "builtin:0", "builtin:1", "--workers", 2, "--out", "m.zip")
     done = run(*words, "--width", 16, "--height", 12, "--eval-scene", "builtin:2", folder=tmp_path)

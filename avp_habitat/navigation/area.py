@@ -95,15 +95,9 @@ class NavigableArea:
 
     def floor_height(self, points: Float) -> Float:
         """`(n,)` floor heights y in metres under `(n, 3)` points, linear between the centres of cells."""
-        points = np.asarray(points, dtype=np.float64)
-        at = (points[:, [2, 0]] - self.origin[::-1]) / self.cell_m - 0.5
-        at = np.clip(at, 0, np.array(self.mask.shape) - 1)
-        row, column = np.minimum(np.floor(at).astype(np.int64), np.maximum(np.array(self.mask.shape) - 2, 0)).T
-        row_after, column_after = np.minimum(np.stack([row, column], 1) + 1, np.array(self.mask.shape) - 1).T
-        up, across = at[:, 0] - row, at[:, 1] - column
-        near = self.heights[row, column] * (1 - across) + self.heights[row, column_after] * across
-        far = self.heights[row_after, column] * (1 - across) + self.heights[row_after, column_after] * across
-        return near * (1 - up) + far * up
+        from avp_habitat.navigation.heights import interpolated
+
+        return interpolated(np.asarray(points, dtype=np.float64), self.origin, self.cell_m, self.heights)
 
     def slide(self, positions: Float, displacements: Float) -> Float:
         """Move agents; an obstacle lets them slide along it, and nothing lets them through.

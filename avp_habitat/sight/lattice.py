@@ -6,11 +6,13 @@ import os
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from avp_habitat.compiled import njit
 from avp_habitat.files import atomic_file
 from avp_habitat.navigation.area import NavigableArea
 
@@ -36,7 +38,7 @@ class Lattice:
     spacing_m: float
     """Distance between neighbouring points, metres."""
 
-    @property
+    @cached_property
     def shape(self) -> tuple[int, int]:
         """Number of points along x and z; every place in the area has four points around it."""
         rows, columns = self.area.mask.shape
@@ -48,12 +50,7 @@ class Lattice:
 
         With them their `(k, 4)` weights of bilinear interpolation, which sum to 1.
         """
-        at = (np.asarray(position)[:, [0, 2]] - self.area.origin) / self.spacing_m
-        low = np.clip(np.floor(at), 0, np.array(self.shape) - 2)
-        share = np.clip(at - low, 0.0, 1.0)
-        corner = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
-        weight = np.where(corner, share[:, None], 1 - share[:, None]).prod(axis=-1)
-        return low.astype(np.int64)[:, None] + corner, weight
+        return _around(np.asarray(position, dtype=np.float64), self.area.origin, self.spacing_m, self.shape)
 
     def feet(self, points: NDArray[np.integer]) -> NDArray[np.float64]:
         """`(k, 3)` where a camera's agent stands for `(k, 2)` lattice points, metres.
@@ -89,6 +86,21 @@ class Lattice:
                 point = np.minimum(low + [i, j], high)
                 near[point[:, 0], point[:, 1]] = True
         return near
+
+
+@njit(cache=True)
+def _around(position, origin, spacing_m, shape):
+    """`Lattice.around`; `origin` `(2,)` is x and z of the first point."""
+    points, weights = np.empty((len(position), 4, 2), np.int64), np.empty((len(position), 4))
+    for k in range(len(position)):
+        x, z = (position[k, 0] - origin[0]) / spacing_m, (position[k, 2] - origin[1]) / spacing_m
+        i, j = min(max(np.floor(x), 0.0), shape[0] - 2.0), min(max(np.floor(z), 0.0), shape[1] - 2.0)
+        across, up = min(max(x - i, 0.0), 1.0), min(max(z - j, 0.0), 1.0)
+        for corner in range(4):
+            di, dj = corner // 2, corner % 2
+            points[k, corner, 0], points[k, corner, 1] = int(i) + di, int(j) + dj
+            weights[k, corner] = (across if di else 1 - across) * (up if dj else 1 - up)
+    return points, weights
 
 
 def cache_folder() -> Path | None:

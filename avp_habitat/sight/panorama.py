@@ -51,8 +51,9 @@ def look_around(simulator: SingleRays, eye: Float) -> Float:
     elevation = np.radians(STEP_DEG) * np.arange(ELEVATIONS)[None] - np.pi / 2
     flat = np.cos(elevation)
     parts = (-np.sin(azimuth) * flat, np.sin(elevation) + 0 * azimuth, -np.cos(azimuth) * flat)
-    ways = np.stack(np.broadcast_arrays(*parts), axis=-1).reshape(-1, 3)
-    distance = simulator.distance(np.repeat(eye, len(ways), axis=0), np.tile(ways, (len(eye), 1)))
+    ways = np.stack(np.broadcast_arrays(*parts), axis=-1).reshape(-1, 3).astype(np.float32)
+    eyes = np.repeat(eye.astype(np.float32), len(ways), axis=0)
+    distance = simulator.distance(eyes, np.tile(ways, (len(eye), 1)))
     return distance.reshape(len(eye), AZIMUTHS, ELEVATIONS)
 
 
@@ -86,41 +87,45 @@ def view_statistics(distance: Float, samples: Samples, max_range_m: float) -> ND
         `(k, YAWS, pitches, 2)` as shares of the range, in units of 1 / 65535.
     """
     inverse = (1.0 / np.maximum(distance, 1e-3)).astype(np.float32)
+    # Yaws are two azimuths apart: even and odd azimuths by themselves, twice around, so that the values of one sample
+    # for all yaws lie side by side.
+    halves = np.stack([inverse[:, 0::2], inverse[:, 1::2]], axis=1).swapaxes(2, 3)
     result = np.empty((len(distance), YAWS, len(samples.azimuth), 2), np.uint16)
-    _statistics(inverse, samples.azimuth, samples.elevation, samples.cosine, samples.inner, max_range_m, result)
+    twice = np.concatenate([halves, halves], axis=3)
+    _statistics(twice, samples.azimuth, samples.elevation, samples.cosine, samples.inner, max_range_m, result)
     return result
 
 
 @njit(cache=True, fastmath=True)
-def _statistics(inverse, azimuth, elevation, cosine, inner, max_range_m, result):
-    azimuths, elevations = inverse.shape[1:]
-    yaws, pitches = result.shape[1:3]
-    stride = azimuths // yaws
-    count = azimuth.shape[1]
+def _statistics(twice, azimuth, elevation, cosine, inner, max_range_m, result):
+    """`view_statistics` of `(k, 2, ELEVATIONS, 2 * YAWS)` inverse distances, by the azimuth's last bit."""
+    elevations, yaws, pitches = twice.shape[2], result.shape[1], result.shape[2]
+    total, greatest = np.empty(yaws, np.float32), np.empty(yaws, np.float32)
     for pitch in range(pitches):
         a0 = np.floor(azimuth[pitch]).astype(np.int64)
         e0 = np.minimum(np.floor(elevation[pitch]).astype(np.int64), elevations - 2)
         wa = (azimuth[pitch] - a0).astype(np.float32)
         we = (elevation[pitch] - e0).astype(np.float32)
         scale = (max_range_m / cosine[pitch]).astype(np.float32)
-        for k in range(len(inverse)):
-            around = inverse[k]
-            for yaw in range(yaws):
-                total, greatest = np.float32(0), np.float32(1)
-                for s in range(count):
-                    a = a0[s] + yaw * stride
-                    a = a - azimuths if a >= azimuths else a
-                    b = a + 1 if a + 1 < azimuths else 0
-                    e = e0[s]
-                    near = around[a, e] + we[s] * (around[a, e + 1] - around[a, e])
-                    far = around[b, e] + we[s] * (around[b, e + 1] - around[b, e])
+        for k in range(len(twice)):
+            total[:], greatest[:] = 0, 1
+            for s in range(a0.size):
+                a, b, e = a0[s], a0[s] + 1, e0[s]
+                low, high = twice[k, a & 1, e, a // 2 :], twice[k, a & 1, e + 1, a // 2 :]
+                low_after, high_after = twice[k, b & 1, e, b // 2 :], twice[k, b & 1, e + 1, b // 2 :]
+                up, across, full = we[s], wa[s], scale[s]
+                share = np.float32(1 if s < inner else 0)
+                for yaw in range(yaws):
+                    near = low[yaw] + up * (high[yaw] - low[yaw])
+                    far = low_after[yaw] + up * (high_after[yaw] - low_after[yaw])
                     # Inverse depth in units of 1 / range, at least 1: a depth beyond the range counts as the range.
-                    value = max((near + wa[s] * (far - near)) * scale[s], np.float32(1))
-                    greatest = max(greatest, value)
-                    if s < inner:
-                        total += 1 / value
-                result[k, yaw, pitch, 0] = np.uint16(65535 / greatest + 0.5)
-                result[k, yaw, pitch, 1] = np.uint16(65535 * total / inner + 0.5)
+                    value = (near + across * (far - near)) * full
+                    value = value if value > np.float32(1) else np.float32(1)
+                    greatest[yaw] = value if value > greatest[yaw] else greatest[yaw]
+                    total[yaw] += share / value
+            for yaw in range(yaws):
+                result[k, yaw, pitch, 0] = np.uint16(65535 / greatest[yaw] + 0.5)
+                result[k, yaw, pitch, 1] = np.uint16(65535 * total[yaw] / inner + 0.5)
 
 
 @njit(cache=True)

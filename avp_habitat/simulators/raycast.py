@@ -147,7 +147,7 @@ class RaycastSimulator:
 
     def distance(self, origin: NDArray[np.floating], direction: NDArray[np.floating]) -> NDArray[np.float32]:
         """Length of rays up to the first surface; see `simulators.base.SingleRays.distance`."""
-        return self._rays.cast(np.concatenate([origin, direction], axis=1).astype(np.float32))["t_hit"]
+        return self._rays.cast(np.concatenate([origin, direction], axis=1, dtype=np.float32))["t_hit"]
 
     def surface_below(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
         """`(n,)` heights y in metres of the first surface straight below `(n, 3)` points; NaN where there is none."""

@@ -83,6 +83,7 @@ class ViewpointTask:
         self.steps = np.zeros(agents, dtype=np.int64)
         self.position = np.zeros((agents, 3))
         self.yaw, self.pitch = np.zeros((2, agents))
+        self._poses = np.zeros((agents, 4, 4))
         self._first_seen = np.zeros((agents, 0), dtype=np.int16)
         for index, scene in enumerate(scenes[:agents]):
             rows = self._everyone[index :: len(scenes)]
@@ -247,12 +248,12 @@ class ViewpointTask:
         return [(self._rooms[index], np.flatnonzero(rooms == index)) for index in np.unique(rooms) if index >= 0]
 
     def _views(self, rows: Rows) -> Views:
-        position, yaw, pitch = self.position[rows], self.yaw[rows], self.pitch[rows]
-        return Views(position, yaw, pitch, motion.sensor_poses(self.settings, position, yaw, pitch))
+        return Views(self.position[rows], self.yaw[rows], self.pitch[rows], self._poses[rows])
 
     def _remember(self, rows: Rows) -> None:
-        """Enter where some agents are now into their paths."""
+        """Enter where some agents are now into their paths, and where their cameras are."""
         steps = self.steps[rows]
+        self._poses[rows] = motion.sensor_poses(self.settings, self.position[rows], self.yaw[rows], self.pitch[rows])
         self._path[rows, steps] = self.position[rows]
         self._angles[rows, steps, 0], self._angles[rows, steps, 1] = self.yaw[rows], self.pitch[rows]
         for room, chosen in self._by_room(rows):

@@ -22,7 +22,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.files import check_new, check_writable
-from avp_sb3.callbacks.base import finished_episodes, required
+from avp_sb3.callbacks.base import finished_episodes, pool_of, required
 from avp_sb3.rerun import APPLICATION
 from avp_sb3.rerun.episode import episode_of, log_episode, metric_path
 from avp_sb3.rerun.layout import eye_above, training_blueprint
@@ -118,11 +118,13 @@ class RerunCallback(BaseCallback):
         self._said: set[str] = set()
         self._shown: set[str] = set()
         areas = self._environments.areas
-        self._roots = {name: f"/{rr.escape_entity_path_part(name)}" if len(areas) > 1 else "" for name in areas}
-        eyes = {self._roots[name]: None if area is None else eye_above(area.centres) for name, area in areas.items()}
+        self._has_one_scene = len(areas) == 1 and pool_of(self.training_env) is None
+        self._eyes = {
+            self._root(name): None if area is None else eye_above(area.centres) for name, area in areas.items()
+        }
         self.path = self._next_path()
         # By default a process has one id, under which a viewer would merge the recordings of two trainings.
-        identity, layout = str(uuid4()), training_blueprint(eyes)
+        identity, layout = str(uuid4()), training_blueprint(self._eyes)
         self._recordings[str(self.path)] = _recording_in(self.path, identity, layout)
         # An interrupted training has no end that would finish the file.
         atexit.register(self.close)
@@ -168,8 +170,10 @@ class RerunCallback(BaseCallback):
         camera = self._environments.camera(index, width=width, height=height)
         views = self._environments.pictures(index, trajectory, camera, at_most=self._pictures)
         episode = episode_of(trajectory, self._environments.get("area", index), camera, views)
-        root = self._roots.get(self._environments.get("scene_name", index, ""), "")
+        root = self._root(self._environments.get("scene_name", index, ""))
         is_new = root not in self._shown
+        if root not in self._eyes:
+            self._lay_out(root, index)
         room = self._environments.room(index) if is_new else None
         if room is not None and not self._has_room(sum(array.nbytes for array in room)):
             room = None
@@ -183,6 +187,18 @@ class RerunCallback(BaseCallback):
         self._largest = max(self._largest, self._file_size - size)
         self._spent += time.monotonic() - began
         self._due = self._episodes + self._every
+
+    def _root(self, scene: str) -> str:
+        """The entity path of a scene: the only one of a training has none of its own."""
+        return "" if self._has_one_scene else f"/{rr.escape_entity_path_part(scene)}"
+
+    def _lay_out(self, root: str, index: int) -> None:
+        """Give a scene of a pool, which an environment has entered, a tab instead of the one that came first."""
+        area = self._environments.get("area", index)
+        del self._eyes[next(iter(self._eyes))]
+        self._eyes[root] = None if area is None else eye_above(area.centres)
+        for recording in self._recordings.values():
+            recording.send_blueprint(training_blueprint(self._eyes))
 
     def _send_figures(self) -> None:
         curves = list(_curves(self._kept)) if self._has_room() else []

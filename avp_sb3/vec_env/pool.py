@@ -10,7 +10,7 @@ from avp_habitat.errors import SceneError
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 
-TURNOVER = 8
+TURNOVER = 100
 """For how many whole episodes of an agent a scene of a pool is held."""
 _KINDS = {"builtin": "rooms", "builtin-home": "homes"}
 _FEW = 5
