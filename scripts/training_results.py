@@ -26,6 +26,7 @@ from tqdm import tqdm
 from avp_habitat import command
 from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.ranges import Range, hold_ranges
+from avp_habitat.scenes.location import HOME, ROOM
 
 ROOT = Path(__file__).resolve().parent.parent
 BASELINES = ("heuristic", "random", "spin", "frontier", "greedy", "oracle")
@@ -360,7 +361,7 @@ def main(options: TrainingResults) -> None:
         write_tables(options.out, [Path(scene).name for scene in options.scenes])
         return
     for scene in options.scenes:
-        if not scene.startswith("builtin:") and not (ROOT / scene).is_file():
+        if not scene.startswith((ROOM, HOME)) and not (ROOT / scene).is_file():
             raise UsageError(f"{scene}: no such file")
     os.environ.setdefault("MLFLOW_TRACKING_URI", f"sqlite:///{(ROOT / options.work / 'mlflow.db').resolve()}")
     options.work.mkdir(parents=True, exist_ok=True)

@@ -69,6 +69,16 @@ def test_the_benchmark_of_scenes_measures_rooms_and_halls(tmp_path):
         assert 0 < row["made_share"] <= 1
 
 
+def test_the_benchmark_of_generation_sets_a_home_beside_a_room(tmp_path):
+    results = report(run("generation.py", "--seeds", 5, folder=tmp_path), tmp_path)
+    assert [row["scene"] for row in results["scenes"]] == ["builtin:5", "builtin-home:5"]
+    rooms, homes = (row["median_m2"] for row in results["kinds"])
+    assert rooms == pytest.approx(28.0, abs=0.1)
+    assert homes == pytest.approx(34.0, abs=0.15)
+    for row in results["kinds"]:
+        positive(row, "cpu_s_per_m2", "triangles_per_m2")
+
+
 def test_the_benchmark_of_export_sets_written_views_beside_their_rays(tmp_path):
     words = ("--scene", "builtin:1", "--views", 3, "--rounds", 2, "--width", 48, "--height", 36)
     (row,) = report(run("export.py", *words, folder=tmp_path), tmp_path)["export"]

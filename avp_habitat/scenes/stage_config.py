@@ -81,7 +81,7 @@ class SceneLocation:
     """Where a scene is."""
 
     name: str
-    """As rollouts call it, without folders: a file's name, `room_0`, or `builtin:SEED`."""
+    """As rollouts call it, without folders: a file's name, `room_0`, `builtin:SEED` or `builtin-home:SEED`."""
     asset: Path | None
     """The mesh file that is shown; None for a generated room."""
     up: Vector = Y_UP[0]

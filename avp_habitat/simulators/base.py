@@ -30,7 +30,7 @@ class Simulator(Protocol):
     version: str
     """Version of the engine that renders."""
     scene: str
-    """What the user called the scene, without folders: a file's name or `builtin:SEED`."""
+    """What the user called the scene, without folders: a file's name, `builtin:SEED` or `builtin-home:SEED`."""
     scene_digest: str
     """Hexadecimal SHA-256 of the scene's content."""
     scene_frame: Frame
