@@ -23,6 +23,8 @@ SURFACE_SPACING_M = 0.4
 """One point for each cube of this edge that holds some surface, metres."""
 SURFACE_RANGE_M = 4.0
 """A surface counts as seen from this near, metres: from farther off its texture is too coarse to reconstruct."""
+SPARSE_RANGE_M = 6.0
+"""The same for plans of two looks at each point, where more of the room that one sees at once is better, metres."""
 TABLE_ENTRIES = 30_000_000
 """Most pairs of a place and a cell: one ray each to prepare, and two bytes each to keep."""
 
@@ -117,7 +119,10 @@ def scene_places(
     stride, cells = _stride(area.mask, most if isinstance(simulator, SingleRays) else min(most, _PANORAMAS))
     places = area.centres[cells]
     range_m = np.full(len(points), settings.max_range_m)
-    range_m[0 if sparse else len(area.centres) :] = np.minimum(SURFACE_RANGE_M, settings.max_range_m)
+    if sparse:
+        range_m[:] = min(SPARSE_RANGE_M, settings.max_range_m)
+    else:
+        range_m[len(area.centres) :] = min(SURFACE_RANGE_M, settings.max_range_m)
     sees = _unhidden(simulator, places, points, range_m, settings)
     grid = np.full(area.mask.shape, -1, dtype=np.int64)
     grid[tuple(np.argwhere(area.mask)[cells].T)] = np.arange(len(cells))
