@@ -70,7 +70,7 @@ def looks_at_points(env, actions):
         env.step(int(action))
         pose = env.camera_to_world[None]
         pairs = candidates(
-            pose, env.settings.intrinsics, places.points, np.ones((1, len(places.points)), bool), max_range_m=6
+            pose, env.settings.intrinsics, places.points, np.ones((1, len(places.points)), bool), max_range_m=10
         )
         seen = env.simulator.visible(pose, env.settings.intrinsics, places.points, pairs, tolerance_m=0.1)
         for point in pairs[seen, 1]:

@@ -23,8 +23,6 @@ SURFACE_SPACING_M = 0.4
 """One point for each cube of this edge that holds some surface, metres."""
 SURFACE_RANGE_M = 4.0
 """A surface counts as seen from this near, metres: from farther off its texture is too coarse to reconstruct."""
-SPARSE_RANGE_M = 6.0
-"""The same for plans of two looks at each point, where more of the room that one sees at once is better, metres."""
 TABLE_ENTRIES = 30_000_000
 """Most pairs of a place and a cell: one ray each to prepare, and two bytes each to keep."""
 
@@ -108,7 +106,7 @@ def scene_places(
     """Look from every place at every cell within range, and find the ways between the places.
 
     With `surfaces`, points on other surfaces count like floor cells once they are seen from near; if `sparse`, the
-    floor has no more points than those, and they too count from near. The places' spacing is the smallest multiple of
+    floor has no more points than those, and all count from afar. The places' spacing is the smallest multiple of
     a cell that gives no more than `entries` pairs of a place and a cell.
     """
     area = simulator.area
@@ -119,9 +117,7 @@ def scene_places(
     stride, cells = _stride(area.mask, most if isinstance(simulator, SingleRays) else min(most, _PANORAMAS))
     places = area.centres[cells]
     range_m = np.full(len(points), settings.max_range_m)
-    if sparse:
-        range_m[:] = min(SPARSE_RANGE_M, settings.max_range_m)
-    else:
+    if not sparse:
         range_m[len(area.centres) :] = min(SURFACE_RANGE_M, settings.max_range_m)
     sees = _unhidden(simulator, places, points, range_m, settings)
     grid = np.full(area.mask.shape, -1, dtype=np.int64)
