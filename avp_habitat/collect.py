@@ -3,7 +3,7 @@
 import os
 import shlex
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,6 +23,7 @@ from avp_habitat.rollout.capture import VIEWS, capture_heldout, capture_step, pu
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
+from avp_habitat.task.budget import BUDGET_HELP, Budget, budget_for
 from avp_habitat.task.rewards import REWARDS_HELP
 from avp_habitat.task.settings import OBSERVATIONS_HELP, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
@@ -51,8 +52,7 @@ class Collect:
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """Of the start and of policies that draw at random."""
     metrics: Annotated[tuple[str, ...], arg(help=METRICS_HELP)] = ()
-    budget: int = 80
-    """Steps, which are views."""
+    budget: Annotated[Budget, arg(help=BUDGET_HELP)] = 80
     width: Annotated[int, Range(8, 8192)] = 640
     """Of the pictures in pixels."""
     height: Annotated[int, Range(8, 8192)] = 480
@@ -72,8 +72,12 @@ class Collect:
         hold_ranges(self)
 
 
-def _settings(options: Collect) -> TaskSettings:
-    return TaskSettings(reward=options.reward, budget=options.budget, metrics=options.metrics)
+def _settings(options: Collect, area_m2: float | None = None) -> TaskSettings:
+    """Of the task; where the scene is not open yet, with any budget in place of `auto`."""
+    settings = TaskSettings(reward=options.reward, metrics=options.metrics)
+    if options.budget == "auto" and area_m2 is None:
+        return settings
+    return replace(settings, budget=budget_for(options.budget, area_m2 or 0.0))
 
 
 def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: int = VIEWS) -> dict[str, Any]:
@@ -87,10 +91,10 @@ def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: 
         AVPError: the scene, the simulator, the policy or the disk cannot be used; nothing is left behind.
     """
     check_policy(options.policy)
-    settings = settings or _settings(options)
     camera = Intrinsics.from_hfov(options.width, options.height, hfov_deg=TaskSettings.hfov_deg)
     with RolloutWriter(options.out, camera) as writer:
         simulator = open_simulator(options.simulator, options.scene)
+        settings = settings or _settings(options, simulator.area.area_m2)
         env, policy = make_policy_env(
             options.policy,
             simulator,

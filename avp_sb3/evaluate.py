@@ -3,7 +3,7 @@
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,6 +20,7 @@ from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.drawing import draw_trajectory
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
+from avp_habitat.task.budget import BUDGET_HELP, Budget, budget_for
 from avp_habitat.task.rewards import REWARDS_HELP
 from avp_habitat.task.settings import OBSERVATIONS_HELP, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
@@ -48,8 +49,7 @@ class Evaluate:
     simulator: SimulatorChoice = field(default_factory=SimulatorChoice)
     """Which simulator opens the scene."""
     metrics: Annotated[tuple[str, ...], arg(help=METRICS_HELP)] = ()
-    budget: int = 80
-    """Steps, which are views."""
+    budget: Annotated[Budget, arg(help=BUDGET_HELP)] = 80
     width: int = 160
     """Of the policy's depth image in pixels."""
     height: int = 120
@@ -73,10 +73,9 @@ class Evaluate:
 
     @property
     def settings(self) -> TaskSettings:
-        """Of the task."""
-        return TaskSettings(
-            reward=self.reward, metrics=self.metrics, budget=self.budget, width=self.width, height=self.height
-        )
+        """Of the task; where the budget is `auto`, with the default in its place."""
+        settings = TaskSettings(reward=self.reward, metrics=self.metrics, width=self.width, height=self.height)
+        return settings if self.budget == "auto" else replace(settings, budget=self.budget)
 
 
 def main(options: Evaluate) -> None:
@@ -90,7 +89,8 @@ def main(options: Evaluate) -> None:
     simulator = open_simulator(options.simulator, options.scene)
     # All of them before the first episode, so that the last one's fault does not cost the others' time.
     how = {name: getattr(options, name) for name in ("observation", "stochastic", "trusted")}
-    runners = [PolicyRunner(policy, simulator, options.settings, **how) for policy in options.policy]
+    settings = replace(options.settings, budget=budget_for(options.budget, simulator.area.area_m2))
+    runners = [PolicyRunner(policy, simulator, settings, **how) for policy in options.policy]
     done: dict[str, list[Episode]] = {runner.name: [] for runner in runners}
     try:
         with progress(total=len(runners) * options.episodes, desc="evaluating", unit="episode") as bar:

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from avp_habitat.errors import UsageError
-from avp_habitat.policies.oracle.places import SURFACE_SPACING_M, surface_points
-from avp_habitat.policies.oracle.policy import OraclePolicy, SurveyPolicy
+from avp_habitat.policies.oracle.places import SURFACE_SPACING_M, scene_places, surface_points
+from avp_habitat.policies.oracle.policy import OraclePolicy, SurveyPolicy, make_plan
 from avp_habitat.policies.reactive import RandomPolicy
 from avp_habitat.sight.rules import candidates
 from avp_habitat.task.agent_view import agent_views
@@ -60,3 +60,32 @@ def test_other_ways_of_counting_coverage_are_refused():
     other.reset(seed=0)
     with pytest.raises(UsageError, match="policy survey: plans for coverage_mode 'visible'"):
         SurveyPolicy.for_env(other).predict(np.zeros(12))
+
+
+def looks_at_points(env, actions):
+    """By brute force: how many points of the plan for two looks are seen, and how many along rays 10° apart."""
+    env.reset(seed=4)
+    places, first, second = scene_places(env.simulator, env.settings, surfaces=True, sparse=True), {}, set()
+    for action in actions:
+        env.step(int(action))
+        pose = env.camera_to_world[None]
+        pairs = candidates(
+            pose, env.settings.intrinsics, places.points, np.ones((1, len(places.points)), bool), max_range_m=10
+        )
+        seen = env.simulator.visible(pose, env.settings.intrinsics, places.points, pairs, tolerance_m=0.1)
+        for point in pairs[seen, 1]:
+            ray = pose[0, :3, 3] - places.points[point]
+            ray /= np.linalg.norm(ray)
+            if ray @ first.setdefault(point, ray) <= np.cos(np.radians(10)):
+                second.add(point)
+    return len(first), len(second)
+
+
+def test_the_survey_for_multiview_gets_second_looks_from_other_directions(env):
+    env.reset(seed=4)
+    once, twice = (
+        looks_at_points(env, make_plan(agent_views(env)[0], objective=objective, width=NARROW).actions)
+        for objective in ("surface", "multiview")
+    )
+    assert twice[1] > 1.15 * once[1]
+    assert twice[0] > 0.9 * once[0]

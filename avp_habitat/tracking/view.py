@@ -27,6 +27,7 @@ _COLOURS = {
     "greedy": "#1f77b4",
     "oracle": "#9467bd",
     "survey": "#e377c2",
+    "survey-multiview": "#d6278f",
 }
 _MODEL_COLOURS = ("#d62728", "#ff7f0e", "#2ca02c", "#a55194", "#637939", "#843c39", "#e7969c", "#e7ba52")
 _LOG = logging.getLogger(__name__)

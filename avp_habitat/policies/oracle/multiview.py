@@ -55,27 +55,29 @@ def plan_second_looks(places: ScenePlaces, view: AgentView, views: int, width: i
     """
     seen, first = np.zeros((1, 2 * len(places.wanted)), np.uint64), np.zeros((1, len(places.points), 3), np.float32)
     states = TwiceStates(view.position[None], np.array([view.yaw]), np.array([view.pitch]), seen, first, np.zeros(1))
-    history = []
+    weight, history = picture_shares(places, view.settings), []
     for left in range(views - 1, -1, -1):
-        states, parent, action = _advance(places, view.settings, states, left, width)
+        states, parent, action = _advance(places, view.settings, states, weight, left, width)
         history.append((parent, action))
     return back_from(int(np.argmax(states.value)), history)
 
 
 def _advance(
-    places: ScenePlaces, settings: TaskSettings, states: TwiceStates, left: int, width: int
+    places: ScenePlaces, settings: TaskSettings, states: TwiceStates, weight: Float, left: int, width: int
 ) -> tuple[TwiceStates, NDArray[np.int64], NDArray[np.int64]]:
     moves: Moves = all_moves(places, settings, states.position, states.yaw, states.pitch)
     pose = sensor_poses(settings, moves.position, moves.yaw, moves.pitch)
     eye, parent = np.ascontiguousarray(pose[:, :3, 3]), moves.parent
     camera = camera_numbers(settings.intrinsics)
-    fresh, gain = look_twice(parent, moves.place, pose, camera, places.sees, places.points, states.seen, states.first)
+    fresh, gain = look_twice(
+        parent, moves.place, pose, camera, places.sees, places.points, states.seen, states.first, weight
+    )
     value = states.value[parent] + (left + 1 + END) * (gain @ np.array([FIRST, SECOND]))
     seen = states.seen[parent] | fresh
     hope = outlook_twice(
         (parent, moves.place, eye, moves.heading),
         (seen, fresh, states.first),
-        (places.wanted, places.points, places.reach, places.heading),
+        (places.wanted, places.points, places.reach, places.heading, weight),
         turning(settings),
         left,
         settings.forward_m,
@@ -90,6 +92,20 @@ def _advance(
     return TwiceStates(*state, seen[kept], first, value[kept]), parent[kept], moves.action[kept]
 
 
+def picture_shares(places: ScenePlaces, settings: TaskSettings) -> Float:
+    """`(m,)` how large the cubes of the points are in the pictures of level cameras all over the floor; their mean is 1.
+
+    Otherwise the ceiling and the floor near the camera, which few pictures show, would count like the walls.
+    """
+    shares, eye = np.zeros(len(places.points)), places.position + [0.0, settings.sensor_height_m, 0.0]
+    steepest = settings.intrinsics.height / 2 / settings.intrinsics.fy
+    for place, seen in zip(eye, unpack(places.sees, len(shares)), strict=True):
+        x, y, z = (places.points[seen] - place).T
+        level = np.hypot(x, z)
+        shares[seen] += (np.abs(y) <= steepest * level) / np.maximum(level**2 + y**2, 0.25)
+    return shares / max(shares.mean(), 1e-12)
+
+
 @njit(cache=True)
 def _cosine_to(first, eye, point):
     """Cosine of the angle at a point between its first ray and that to an eye, and the eye's distance in metres."""
@@ -99,11 +115,11 @@ def _cosine_to(first, eye, point):
 
 
 @njit(cache=True)
-def look_twice(parent, place, pose, camera, sees, points, seen, first):
+def look_twice(parent, place, pose, camera, sees, points, seen, first, weight):
     """What n candidate views add; arguments as of `kernels.look`, `seen` and `first` those of `TwiceStates`.
 
     Returns:
-        `(n, 2 * words)` points seen for the first time, and points seen along a second ray; `(n, 2)` how many.
+        `(n, 2 * words)` points seen for the first time, and points seen along a second ray; `(n, 2)` what they weigh.
     """
     words = sees.shape[1]
     fresh, gain = np.zeros((len(parent), 2 * words), np.uint64), np.zeros((len(parent), 2), np.float64)
@@ -118,10 +134,10 @@ def look_twice(parent, place, pose, camera, sees, points, seen, first):
                     continue
                 if not seen[parent[i], k] & mark:
                     fresh[i, k] |= mark
-                    gain[i, 0] += 1
+                    gain[i, 0] += weight[point]
                 elif _cosine_to(first[parent[i], point], pose[i, :3, 3], points[point])[0] <= _COSINE:
                     fresh[i, words + k] |= mark
-                    gain[i, 1] += 1
+                    gain[i, 1] += weight[point]
     return fresh, gain
 
 
@@ -139,7 +155,7 @@ def outlook_twice(candidates, known, scene, turns, left, forward_m, rates):
     """
     parent, place, eye, yaw = candidates
     seen, fresh, first = known
-    wanted, points, reach, heading = scene
+    wanted, points, reach, heading, weight = scene
     near_turn, far_turn = turns
     worth_first, worth_second, steps_aside, end, pace = rates
     words, result = len(wanted), np.zeros(len(place), np.float64)
@@ -157,11 +173,11 @@ def outlook_twice(candidates, known, scene, turns, left, forward_m, rates):
                 turned = 1.0 + (near_turn[turn] if half == 0 else far_turn[turn])
                 if not seen[i, k] & mark:
                     steps = turned + 0.5 * half
-                    result[i] += worth_first * _rest(left, pace * steps, end)
-                    result[i] += worth_second * _rest(left, pace * (steps + steps_aside), end)
+                    result[i] += weight[point] * worth_first * _rest(left, pace * steps, end)
+                    result[i] += weight[point] * worth_second * _rest(left, pace * (steps + steps_aside), end)
                     continue
                 cosine, distance = _cosine_to(first[parent[i], point], eye[i], points[point])
                 apart = 0.0 if fresh[i, k] & mark else np.sqrt(max(2 - 2 * cosine, 0.0))
                 aside = max(_CHORD - apart, 0.0) * distance / forward_m
-                result[i] += worth_second * _rest(left, pace * (turned + max(aside, 0.5 * half)), end)
+                result[i] += weight[point] * worth_second * _rest(left, pace * (turned + max(aside, 0.5 * half)), end)
     return result

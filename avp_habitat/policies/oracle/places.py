@@ -106,7 +106,7 @@ def scene_places(
     """Look from every place at every cell within range, and find the ways between the places.
 
     With `surfaces`, points on other surfaces count like floor cells once they are seen from near; if `sparse`, the
-    floor has no more points than those, and they too count from near. The places' spacing is the smallest multiple of
+    floor has no more points than those, and all count from afar. The places' spacing is the smallest multiple of
     a cell that gives no more than `entries` pairs of a place and a cell.
     """
     area = simulator.area
@@ -117,7 +117,8 @@ def scene_places(
     stride, cells = _stride(area.mask, most if isinstance(simulator, SingleRays) else min(most, _PANORAMAS))
     places = area.centres[cells]
     range_m = np.full(len(points), settings.max_range_m)
-    range_m[0 if sparse else len(area.centres) :] = np.minimum(SURFACE_RANGE_M, settings.max_range_m)
+    if not sparse:
+        range_m[len(area.centres) :] = min(SURFACE_RANGE_M, settings.max_range_m)
     sees = _unhidden(simulator, places, points, range_m, settings)
     grid = np.full(area.mask.shape, -1, dtype=np.int64)
     grid[tuple(np.argwhere(area.mask)[cells].T)] = np.arange(len(cells))
