@@ -20,7 +20,7 @@ from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.simulators.registry import SimulatorChoice
 from avp_habitat.task.rewards import REWARDS_HELP
-from avp_habitat.task.settings import OBSERVATIONS_HELP, TaskSettings
+from avp_habitat.task.settings import OBSERVATIONS_HELP, STOP, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
 from avp_sb3.exchange.sb3 import note_training, start_observation, started_ppo
 from avp_sb3.presets import MAP, PRESETS, PPOPreset
@@ -63,11 +63,12 @@ class Train:
     simulator: SimulatorChoice = field(default_factory=SimulatorChoice)
     """Which simulator opens the scenes."""
     rays: bool = False
-    """Cast all rays instead of looking views up in the scenes' tables."""
-    width: int = 160
-    """Of the policy's depth image in pixels."""
-    height: int = 120
-    """Of the policy's depth image in pixels."""
+    """Cast all rays instead of looking views up in the scenes' tables; always so with rooms or homes, which are left
+    before tables would pay."""
+    width: int | None = None
+    """Of the policy's depth image in pixels (omitted: 160; 16 with rooms or homes)."""
+    height: int | None = None
+    """Of the policy's depth image in pixels (omitted: 120; 12 with rooms or homes)."""
     seed: int = 0
     """Of the policy and the starts."""
     out: Path = Path("runs/ppo.zip")
@@ -124,10 +125,15 @@ class Train:
             reward=self.reward,
             observation=self.observation,
             metrics=self.metrics,
-            lookup=not self.rays and self.simulator.single_rays,
-            width=self.width,
-            height=self.height,
+            lookup=not (self.rays or self.pooled) and self.simulator.single_rays,
+            width=self.width or (16 if self.pooled else 160),
+            height=self.height or (12 if self.pooled else 120),
         )
+
+    @property
+    def pooled(self) -> bool:
+        """Whether the scenes come and go."""
+        return self.rooms + self.homes > 0
 
 
 def _environment(options: Train) -> Any:
@@ -138,7 +144,7 @@ def _environment(options: Train) -> Any:
 
     choice, scenes = options.simulator, options.scenes
     common = {"agents": options.preset.n_envs, "settings": options.settings, "seed": options.seed, **vars(choice)}
-    if options.rooms or options.homes:
+    if options.pooled:
         common |= {"open_scenes": options.open_scenes, "turnover": options.turnover}
     if options.workers is None and (len(scenes) == 1 or not choice.one_per_process):
         return VecMonitor(AVPVecEnv(scenes, **common))
@@ -154,7 +160,9 @@ def _model(options: Train, env: Any) -> Any:
         from stable_baselines3 import PPO
 
         policy = "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy"
-        return PPO(policy, env, device="cpu", **arguments)
+        model = PPO(policy, env, device="cpu", **arguments)
+        model.policy.action_net.bias.data[STOP] = options.preset.stop_logit  # type: ignore[union-attr, index]
+        return model
     with tempfile.TemporaryDirectory() as folder:
         path = _resumed_file(options.resume, folder)
         if (statistics := statistics_of(path)) is not None:
@@ -229,7 +237,7 @@ def main(options: Train) -> None:
     torch.set_num_threads(1)
     env = _environment(options)
     model = _model(options, env)
-    note_training(model, options.settings, options.scene)
+    note_training(model, options.settings, options.scenes)
     tracking = MLflowCallback(options.experiment, run_name=options.run_name)
     callbacks = _callbacks(options, tracking)
     begun = model.num_timesteps

@@ -17,6 +17,7 @@ from avp_habitat.simulators.base import Frames, Simulator, SingleRays, pictures
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.task.env import step_info
 from avp_habitat.task.observations import Observed, action_space, each
+from avp_habitat.task.rewards import always, find_reward
 from avp_habitat.task.settings import TaskSettings
 from avp_habitat.task.task import ViewpointTask
 from avp_sb3.vec_env.pool import TURNOVER, ScenePool
@@ -79,6 +80,9 @@ class AVPVecEnv(VecEnv):
         self._change_every = -(-turnover * self.settings.budget // self._open_scenes)
         self._next = np.full(agents, -1)
         self._left: dict[int, Simulator] = {}
+        # Where an episode may be ended at any time, the end of the budget, which is observed, is an end like any other:
+        # bootstrapping a value there would pay for not stopping.
+        self._stops_always = getattr(find_reward(self.settings.reward), "stops", None) is always
         self.render_mode = None
         self._task = ViewpointTask(opened, self.settings, agents)
         super().__init__(agents, self._task.kind.space, action_space())
@@ -133,7 +137,7 @@ class AVPVecEnv(VecEnv):
         ended = np.flatnonzero(done)
         for row in ended:
             infos[row]["terminal_observation"] = each(lambda values, row=row: values[row].copy(), observation)
-            infos[row]["TimeLimit.truncated"] = bool(outcome.truncated[row])
+            infos[row]["TimeLimit.truncated"] = bool(outcome.truncated[row]) and not self._stops_always
         if len(ended):
             self._enter_next(ended)
             each(lambda values, first: values.__setitem__(ended, first), observation, self._restart(ended.tolist()))
