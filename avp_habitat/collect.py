@@ -15,7 +15,15 @@ from avp_habitat.errors import RolloutError
 from avp_habitat.files import check_writable
 from avp_habitat.metrics import METRICS_HELP
 from avp_habitat.plugins import name_of
-from avp_habitat.policies.registry import POLICIES_HELP, TRUSTED, check_policy, described, make_policy_env, steps_of
+from avp_habitat.policies.registry import (
+    POLICIES_HELP,
+    TRUSTED,
+    check_policy,
+    described,
+    make_policy_env,
+    reward_of,
+    steps_of,
+)
 from avp_habitat.poses import Intrinsics
 from avp_habitat.provenance import nerfacto_line
 from avp_habitat.ranges import Range, hold_ranges
@@ -42,7 +50,9 @@ class Collect:
     policy: Annotated[str, arg(help=POLICIES_HELP)]
     out: Path
     """The rollout folder to write; must not exist."""
-    reward: Annotated[str, arg(help=REWARDS_HELP)] = "proposed"
+    reward: Annotated[str | None, arg(help=f"{REWARDS_HELP} (omitted: that of the policy's weights, or proposed)")] = (
+        None
+    )
     observation: Annotated[
         str | None,
         arg(help=f"{OBSERVATIONS_HELP} (omitted: the first that fits the policy)"),
@@ -74,7 +84,7 @@ class Collect:
 
 def _settings(options: Collect, area_m2: float | None = None) -> TaskSettings:
     """Of the task; where the scene is not open yet, with any budget in place of `auto`."""
-    settings = TaskSettings(reward=options.reward, metrics=options.metrics)
+    settings = TaskSettings(reward=options.reward or reward_of(options.policy), metrics=options.metrics)
     if options.budget == "auto" and area_m2 is None:
         return settings
     return replace(settings, budget=budget_for(options.budget, area_m2 or 0.0))

@@ -15,7 +15,7 @@ from avp_habitat.command import progress
 from avp_habitat.errors import UsageError
 from avp_habitat.files import check_new, check_writable
 from avp_habitat.metrics import METRICS_HELP
-from avp_habitat.policies.registry import POLICIES_HELP, TRUSTED, check_policy, described
+from avp_habitat.policies.registry import POLICIES_HELP, TRUSTED, check_policy, described, reward_of
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.drawing import draw_trajectory
 from avp_habitat.scenes.location import HELP as SCENES
@@ -44,7 +44,9 @@ class Evaluate:
     """Per policy."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 1000
     """Of the first start; episode i uses SEED + i."""
-    reward: Annotated[str, arg(help=REWARDS_HELP)] = "proposed"
+    reward: Annotated[str | None, arg(help=f"{REWARDS_HELP} (omitted: that of each policy's weights, or proposed)")] = (
+        None
+    )
     observation: Annotated[str | None, arg(help=f"{OBSERVATIONS_HELP} (omitted: the model's own)")] = None
     simulator: SimulatorChoice = field(default_factory=SimulatorChoice)
     """Which simulator opens the scene."""
@@ -74,7 +76,8 @@ class Evaluate:
     @property
     def settings(self) -> TaskSettings:
         """Of the task; where the budget is `auto`, with the default in its place."""
-        settings = TaskSettings(reward=self.reward, metrics=self.metrics, width=self.width, height=self.height)
+        reward = self.reward or TaskSettings.reward
+        settings = TaskSettings(reward=reward, metrics=self.metrics, width=self.width, height=self.height)
         return settings if self.budget == "auto" else replace(settings, budget=self.budget)
 
 
@@ -90,7 +93,11 @@ def main(options: Evaluate) -> None:
     # All of them before the first episode, so that the last one's fault does not cost the others' time.
     how = {name: getattr(options, name) for name in ("observation", "stochastic", "trusted")}
     settings = replace(options.settings, budget=budget_for(options.budget, simulator.area.area_m2))
-    runners = [PolicyRunner(policy, simulator, settings, **how) for policy in options.policy]
+    rewards = [options.reward or reward_of(policy) for policy in options.policy]
+    runners = [
+        PolicyRunner(policy, simulator, replace(settings, reward=reward), **how)
+        for policy, reward in zip(options.policy, rewards, strict=True)
+    ]
     done: dict[str, list[Episode]] = {runner.name: [] for runner in runners}
     try:
         with progress(total=len(runners) * options.episodes, desc="evaluating", unit="episode") as bar:

@@ -18,6 +18,7 @@ from avp_habitat.policies.weights.format import read_facts, read_weights
 from avp_habitat.policies.weights.policy import PretrainedPolicy
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.task.env import AVPEnv
+from avp_habitat.task.rewards import REWARDS
 from avp_habitat.task.settings import OBSERVATIONS, TaskSettings
 
 
@@ -101,6 +102,17 @@ def exported_file(policy: Any) -> Path | None:
     """
     others = [name for name in plugins.names("avp.policies", POLICIES) if name != PRETRAINED]
     return None if policy in others else weights_file(policy)
+
+
+def reward_of(policy: Any) -> str:
+    """The reward under which a policy acts where none is given: weights name theirs, else it is the task's default.
+
+    It decides when a stop ends the episode. A reward that is `module:object` has to be given, so that no file chooses
+    what is imported.
+    """
+    weights = exported_file(policy)
+    name = None if weights is None else read_facts(weights)["settings"].get("reward")
+    return name if name in REWARDS else str(TaskSettings.reward)
 
 
 def make_policy(policy: Any, env: AVPEnv, seed: int, *, trusted: bool = False) -> Policy:
