@@ -26,7 +26,7 @@ from avp_habitat.task.trajectory import Trajectory
 from avp_habitat.task.views import Shown, Views
 
 Float = NDArray[np.floating]
-Rows = NDArray[np.int64]
+Rows = NDArray[np.integer]
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ class ViewpointTask:
     def _shown(self, rows: Rows, sense: Callable[[_Room, Rows], Shown]) -> Shown:
         """What the newest views of some agents show, as `sense` finds it for those in one room."""
         if len(self._rooms) == 1:
-            return sense(*self._rooms.values(), rows)
+            return sense(next(iter(self._rooms.values())), rows)
         least, mean = np.empty((2, len(rows)))
         whole = Shown(least, mean, np.empty(len(rows), dtype=np.int64))
         for room, chosen in self._by_room(rows):
