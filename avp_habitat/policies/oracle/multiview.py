@@ -93,7 +93,7 @@ def _advance(
 
 
 def picture_shares(places: ScenePlaces, settings: TaskSettings) -> Float:
-    """`(m,)` how large the cubes of the points are in the pictures of level cameras all over the floor; their mean is 1.
+    """`(m,)` how large the cubes of the points are in the pictures of level cameras all over the floor; on average 1.
 
     Otherwise the ceiling and the floor near the camera, which few pictures show, would count like the walls.
     """
