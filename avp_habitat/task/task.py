@@ -343,9 +343,8 @@ class ViewpointTask:
 
     def _record(self, actions: NDArray, reward: NDArray, parts: dict[str, NDArray], facts: StepFacts) -> None:
         now = (self._everyone, self.steps - 1)
-        columns = {"action": actions, "reward": reward, "coverage": facts.coverage}
-        columns |= {"collided": facts.collided, "redundant": facts.redundant}
-        for name, values in columns.items():
-            self._log[name][now] = values
+        columns = {"action": actions, "reward": reward} | vars(facts)
+        for name in ("action", "reward", "coverage", "collided", "redundant"):
+            self._log[name][now] = columns[name]
         for name in dict.fromkeys([*self._parts, *parts]):
             self._parts[name][now] = parts.get(name, 0.0)
