@@ -65,7 +65,7 @@ ONBOARD = PPOPreset(
     n_epochs=4,
     learning_rate=5e-4,
     linear=True,
-    ent_coef=0.01,
+    ent_coef=0.02,
     net_arch=(128, 64),
     stop_logit=-5.0,
 )

@@ -19,7 +19,7 @@ from avp_habitat.policies.saved_model import is_normalised, load_statistics, sta
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.simulators.registry import SimulatorChoice
-from avp_habitat.task.rewards import REWARDS_HELP
+from avp_habitat.task.rewards import REWARDS_HELP, find_reward, stops_always
 from avp_habitat.task.settings import OBSERVATIONS_HELP, STOP, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
 from avp_sb3.exchange.sb3 import note_training, start_observation, started_ppo
@@ -209,6 +209,7 @@ def _resumed_file(resume: str, folder: str) -> Path:
 
 def _callbacks(options: Train, tracking: Any) -> list[Any]:
     from avp_sb3 import EvaluationCallback, MetricsCallback, RerunCallback
+    from avp_sb3.callbacks.stopping import StopCallback
 
     callbacks: list[Any] = []
     # First, so that scenes that cannot be opened leave no empty run behind.
@@ -217,6 +218,8 @@ def _callbacks(options: Train, tracking: Any) -> list[Any]:
         where: dict[str, Any] = vars(options.simulator) | {"navmesh": None}  # That is the training scene's.
         callbacks.append(EvaluationCallback(options.eval_scene, every=options.eval_every, best_model=best, **where))
     callbacks += [MetricsCallback(), tracking]
+    if stops_always(find_reward(options.reward)):
+        callbacks.append(StopCallback())
     if options.recording is not None:
         callbacks.append(RerunCallback(options.recording))
     return callbacks

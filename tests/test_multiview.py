@@ -84,7 +84,7 @@ def test_the_reward_weighs_both_growths_and_stop_ends_the_episode_at_any_time(co
     outcome = task.step(np.array([STOP]))
     share = 0.3 * outcome.facts.surface + 0.7 * outcome.facts.parallax
     assert outcome.terminated
-    assert outcome.parts["stop"] == pytest.approx(constants.stop_bonus * share)
+    assert outcome.parts["stop"] == pytest.approx(constants.stop_surface_bonus * share)
     assert outcome.facts.coverage < 0.85
 
 

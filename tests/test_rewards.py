@@ -43,6 +43,7 @@ CONSTANTS = RewardConstants(
     redundancy_distance_m=0.21,
     redundancy_angle_deg=4.0,
     stop_bonus=5.3,
+    stop_surface_bonus=2.9,
     stop_per_step_left=0.041,
     early_stop=0.59,
     stop_coverage=0.8,
@@ -85,13 +86,13 @@ def by_hand(name, facts, i):
     discount = 1 + c.visit_decay * int(facts.earlier_visits[i])
     if name == "surface":
         new = {"surface": c.alpha_surface / discount * float(facts.new_surface[i]) ** c.beta}
-        stop = c.stop_bonus * float(facts.surface[i]) if facts.stop_chosen[i] else 0.0
+        stop = c.stop_surface_bonus * float(facts.surface[i]) if facts.stop_chosen[i] else 0.0
     elif name == "multiview":
         w = c.single_weight
         grown = w * float(facts.new_surface[i]) + (1 - w) * float(facts.new_parallax[i])
         new = {"multiview": c.alpha_multiview / discount * grown**c.beta}
         share = w * float(facts.surface[i]) + (1 - w) * float(facts.parallax[i])
-        stop = c.stop_bonus * share if facts.stop_chosen[i] else 0.0
+        stop = c.stop_surface_bonus * share if facts.stop_chosen[i] else 0.0
     else:
         new = {"coverage": c.alpha_proposed / discount * int(facts.new_cells[i]) ** c.beta}
     return new | {"spread": spread, "step": -c.step, "collision": collision, "redundancy": redundancy, "stop": stop}

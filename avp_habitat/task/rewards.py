@@ -51,7 +51,9 @@ class RewardConstants:
     redundancy_angle_deg: Annotated[float, Range(0, 180)] = 5.0
     """δ in degrees, for yaw and pitch alike: below one turn, so that turning on is never redundant."""
     stop_bonus: Amount = 1.0
-    """B_s: reward of stopping with enough coverage, or with all of the surface seen well."""
+    """B_s of `proposed`: reward of stopping with enough coverage."""
+    stop_surface_bonus: Amount = 5.0
+    """B_q of `surface` and `multiview`: reward of stopping with all of the surface seen well."""
     stop_per_step_left: Amount = 0.01
     """λ_e: further reward of `proposed` per step of the budget that was not used."""
     early_stop: Amount = 0.02
@@ -189,8 +191,8 @@ def _costs(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
 
 
 def _stop(share: Number | float, facts: StepFacts, constants: RewardConstants) -> Number:
-    """B_s · share where the episode is ended: going on pays while a view brings more than it costs."""
-    return np.where(facts.stop_chosen, constants.stop_bonus * share, 0.0)
+    """B_q · share where the episode is ended: going on pays while a view brings more than it costs."""
+    return np.where(facts.stop_chosen, constants.stop_surface_bonus * share, 0.0)
 
 
 def _spread(facts: StepFacts, constants: RewardConstants) -> Number:
@@ -239,6 +241,11 @@ def needs_parallax(thing: Any) -> bool:
 def has_stop(reward: RewardFunction) -> bool:
     """Whether the stop action is available under this reward; elsewhere it is "no movement"."""
     return bool(getattr(reward, "stops", False))
+
+
+def stops_always(reward: RewardFunction) -> bool:
+    """Whether stop ends the episode whenever it is chosen."""
+    return getattr(reward, "stops", None) is always
 
 
 def stops_episode(reward: RewardFunction, facts: StepFacts, constants: RewardConstants) -> Bool:
