@@ -12,8 +12,8 @@ class StopCallback(BaseCallback):
     """Raise the bias of stop's logit while too few episodes end by it.
 
     Where stop ends an episode at any time, most stops come too early at first: PPO learns never to stop, tries it no
-    more, and does not find out that a late stop pays. The bias is the same for all observations: with it rising, what is
-    left to the network is to tell when.
+    more, and does not find out that a late stop pays. The bias is the same for all observations: with it rising,
+    what is left to the network is to tell when.
     """
 
     def __init__(self, share: float = 0.95, rate: float = 0.03) -> None:
