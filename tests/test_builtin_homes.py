@@ -21,9 +21,9 @@ from avp_habitat.scenes.location import locate
 from avp_habitat.scenes.mesh import TexturedMesh, merge
 from avp_habitat.simulators.raycast import RaycastSimulator
 
-FEW = (1, 5, 7)
-"""Five rooms with a corridor, two rooms, five rooms with a corridor that ends in the living room."""
-MANY = range(300)
+FEW = (5, 7)
+"""Two rooms, five rooms with a corridor that ends in the living room."""
+MANY = range(150)
 
 
 @cache
@@ -177,7 +177,7 @@ def test_a_doorway_that_is_closed_would_be_found():
         check_walkable(furnished(5)[0], RaycastSimulator(Scene("test", "0", merge([mesh_of(5), shut]))))
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(5))
 def test_furniture_keeps_to_its_place_in_its_room(seed):
     for room, placed in zip(*furnished(seed), strict=True):
         found = []
