@@ -13,12 +13,14 @@ from typing import Any
 from avp_experiment.configuration import TRAIN as TRAIN_SCENE
 from avp_experiment.configuration import Configuration, ExperimentScene, Method, scene_slug
 from avp_habitat.errors import AVPError
-from avp_habitat.task.rewards import find_reward, needs_surface
+from avp_habitat.task.rewards import find_reward, needs_parallax, needs_surface
 
 TRAIN, COLLECT, RECONSTRUCT = "train", "collect", "reconstruct"
 _MADE = {TRAIN: "model.zip", COLLECT: "rollout", RECONSTRUCT: "reconstruction"}
 _START_SEEDS = 1000
 """Seed of the first start of seed 0, and from one start of a seed to its next: more starts leave those before them."""
+PARALLAX_OBSERVATION = "onboard"
+"""What a policy whose reward needs parallax observes; its likeliest actions do as well as sampled ones."""
 _SURFACE_OBSERVATION = {"map": "surface_map"}
 """What a policy whose reward needs the surface observes instead."""
 _CURVES = ("avp/cpv", "avp/coverage", "avp/views", "rollout/ep_rew_mean")
@@ -90,13 +92,16 @@ class _Planner:
 
     def training(self, method: Method, seed: int) -> Cell:
         configuration, preset = self.configuration, self.configuration.preset
-        observation = preset.observation
-        if needs_surface(find_reward(method.reward)):
+        observation, reward = preset.observation, find_reward(method.reward)
+        if needs_parallax(reward):
+            observation = PARALLAX_OBSERVATION
+        elif needs_surface(reward):
             observation = _SURFACE_OBSERVATION.get(observation, observation)
         scenes = [scene.spec for scene in configuration.scenes if scene.role == TRAIN_SCENE]
         name = f"{method.name}-{seed}"
         words = ["python", "-m", "avp_sb3.train", "--scene", *(configuration.rooms if method.in_rooms else scenes)]
-        words += ["--reward", method.reward, "--observation", observation, "--seed", str(seed)]
+        of = ["--start", method.spec] if method.tuned else ["--observation", observation]
+        words += ["--reward", method.reward, *of, "--seed", str(seed)]
         words += ["--steps", str(preset.steps_rooms if method.in_rooms else preset.steps)]
         words += [*configuration.simulator_options, "--out", self._out(TRAIN, name)]
         words += ["--experiment", self.tracking, "--run-name", f"{method.name} (seed {seed})"]
@@ -104,7 +109,8 @@ class _Planner:
 
     def rollout(self, method: Method, seed: int, scene: ExperimentScene, start: int, training: Cell | None) -> Cell:
         preset, (width, height) = self.configuration.preset, self.configuration.preset.size
-        policy = (str(training.output(self.root)), "--stochastic") if training else (method.spec,)
+        policy = (str(training.output(self.root)),) if training else (method.spec,)
+        policy += ("--stochastic",) if training and not needs_parallax(find_reward(method.reward)) else ()
         name = f"{method.name}-{scene_slug(scene.name)}-{seed}-{start}"
         words = ["python", "-m", "avp_habitat.collect", "--scene", scene.spec, "--policy", *policy]
         words += ["--reward", method.reward]

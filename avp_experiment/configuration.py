@@ -15,6 +15,8 @@ TRAIN, UNSEEN = "train", "unseen"
 """Roles of scenes: policies are trained in the former, never in the latter."""
 ROOMS = "_rooms"
 """A learned method whose name ends so is trained in generated rooms, never in the scenes of the experiment."""
+TUNED = "_tuned"
+"""The weights of an exported policy whose name ends so are trained further in the scenes of the experiment."""
 _FIRST_ROOM = 100
 
 
@@ -28,27 +30,21 @@ class Method:
     """It is a reward."""
     in_rooms: bool = False
     """Trained in generated rooms, never in the scenes of the experiment."""
+    tuned: bool = False
+    """It is an exported policy, which is trained further in the scenes."""
 
     @property
     def name(self) -> str:
         """In files and tables."""
-        return self.spec.strip("./").replace(":", ".").replace("/", ".") + (ROOMS if self.in_rooms else "")
+        ending = (ROOMS if self.in_rooms else "") + (TUNED if self.tuned else "")
+        return self.spec.strip("./").replace(":", ".").replace("/", ".") + ending
 
     @property
     def reward(self) -> str:
         """What it learns, or its weights learned, from; of a baseline, which has no use for it, one without a stop."""
-        return self.spec if self.learned else _learned_from(self.spec) or "coverage"
+        from avp_habitat.policies.registry import learned_reward
 
-
-def _learned_from(policy: str) -> str | None:
-    """The reward that an exported policy's file names, so that stops end episodes as in its training."""
-    from avp_habitat.policies.registry import exported_file
-    from avp_habitat.policies.weights.format import read_facts
-
-    path = exported_file(policy)
-    told = None if path is None else read_facts(path)["settings"].get("reward")
-    # No file chooses what is imported.
-    return told if told in plugins.names("avp.rewards", REWARDS) else None
+        return self.spec if self.learned and not self.tuned else learned_reward(self.spec) or "coverage"
 
 
 def known_methods() -> dict[str, Method]:
@@ -70,19 +66,22 @@ DEFAULT = (*BASELINES, *REWARDS, f"proposed{ROOMS}", f"surface{ROOMS}")
 def chosen_methods(names: Sequence[str]) -> tuple[Method, ...]:
     """The methods of these names, each once: known ones in their order, then exported policies and `module:object`.
 
-    The latter is a class or object with `predict`, or else a reward, whose name may end in `_rooms`.
+    The names of exported policies may end in `_tuned`. `module:object` is a class or object with `predict`, or else a
+    reward, whose name may end in `_rooms`.
     """
     from avp_habitat.policies.registry import exported_file
 
     if not names:
         raise UsageError("methods: expected at least one, got none")
     known = known_methods()
-    exported = {name: None for name in names if exported_file(name) is not None}
+    exported = {name: None for name in names if exported_file(name.removesuffix(TUNED)) is not None}
     for name in names:
         if ":" not in name and name not in known and name not in exported:
             raise unknown_name("method", name, known)
     chosen = [method for name, method in known.items() if name in names]
-    chosen += [Method(name) for name in exported if name not in known]
+    for name in (name for name in exported if name not in known):
+        tuned = name.endswith(TUNED)
+        chosen.append(Method(name.removesuffix(TUNED), learned=tuned, tuned=tuned))
     for name in dict.fromkeys(name for name in names if ":" in name and name not in exported):
         spec = name.removesuffix(ROOMS)
         learned = not hasattr(plugins.find("avp.policies", spec, {}), "predict")
@@ -119,13 +118,13 @@ class ExperimentPreset:
 
 
 PRESETS = {
-    "demo": ExperimentPreset(300_000, 300_000, seeds=1, rooms=2, size=(192, 144), iterations=1000, prefixes=()),
+    "demo": ExperimentPreset(100_000, 100_000, seeds=1, rooms=2, size=(192, 144), iterations=1000, prefixes=()),
     "smoke": ExperimentPreset(24_576, 24_576, seeds=1, rooms=2, size=(96, 72), iterations=100, prefixes=(40,)),
     "cpu": ExperimentPreset(700_000, 700_000, size=(192, 144), iterations=300, prefixes=(20, 40)),
     "gpu": ExperimentPreset(1_000_000, 2_000_000, starts=3),
     "paper": ExperimentPreset(300_000, 300_000, observation="numbers", reconstruction="nerfacto"),
 }
-"""demo: one good training, no curves (`make demo`). smoke: minutes, to see that everything works. cpu: two to three
+"""demo: one short training, no curves (`make demo`). smoke: minutes, to see that everything works. cpu: two to three
 hours on two cores. gpu: the same questions at full size. paper: the paper's observation, steps and reconstruction."""
 
 

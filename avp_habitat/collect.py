@@ -20,8 +20,8 @@ from avp_habitat.policies.registry import (
     TRUSTED,
     check_policy,
     described,
+    learned_reward,
     make_policy_env,
-    reward_of,
     steps_of,
 )
 from avp_habitat.poses import Intrinsics
@@ -84,7 +84,8 @@ class Collect:
 
 def _settings(options: Collect, area_m2: float | None = None) -> TaskSettings:
     """Of the task; where the scene is not open yet, with any budget in place of `auto`."""
-    settings = TaskSettings(reward=options.reward or reward_of(options.policy), metrics=options.metrics)
+    reward = options.reward or learned_reward(options.policy) or TaskSettings.reward
+    settings = TaskSettings(reward=reward, metrics=options.metrics)
     if options.budget == "auto" and area_m2 is None:
         return settings
     return replace(settings, budget=budget_for(options.budget, area_m2 or 0.0))

@@ -15,7 +15,7 @@ from avp_habitat.command import progress
 from avp_habitat.errors import UsageError
 from avp_habitat.files import check_new, check_writable
 from avp_habitat.metrics import METRICS_HELP
-from avp_habitat.policies.registry import POLICIES_HELP, TRUSTED, check_policy, described, reward_of
+from avp_habitat.policies.registry import POLICIES_HELP, TRUSTED, check_policy, described, learned_reward
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.drawing import draw_trajectory
 from avp_habitat.scenes.location import HELP as SCENES
@@ -93,7 +93,7 @@ def main(options: Evaluate) -> None:
     # All of them before the first episode, so that the last one's fault does not cost the others' time.
     how = {name: getattr(options, name) for name in ("observation", "stochastic", "trusted")}
     settings = replace(options.settings, budget=budget_for(options.budget, simulator.area.area_m2))
-    rewards = [options.reward or reward_of(policy) for policy in options.policy]
+    rewards = [options.reward or learned_reward(policy) or TaskSettings.reward for policy in options.policy]
     runners = [
         PolicyRunner(policy, simulator, replace(settings, reward=reward), **how)
         for policy, reward in zip(options.policy, rewards, strict=True)

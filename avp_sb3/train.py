@@ -28,6 +28,8 @@ from avp_sb3.vec_env.pool import TURNOVER, describe
 
 FIRST_SEED, _ROOMS_END = 1000, 100_000
 """Of the generated rooms and homes to train in; those from 100,000 on are for tests."""
+_GENTLER = 5
+"""The learning rate is that much lower where a training starts from weights, which a few wild steps would spoil."""
 _MLFLOW = "runs:/"
 _MOST = 1e12
 
@@ -77,7 +79,7 @@ class Train:
     """Go on until --steps are done with a model: a file, or MLflow's runs:/RUN_ID/model.zip."""
     start: Annotated[str | None, arg(metavar="POLICY")] = None
     """Begin with the weights of a policy: pretrained, another name of `python -m avp_sb3.pretrained`, or the folder of
-    one that `python -m avp_sb3.export` wrote."""
+    one that `python -m avp_sb3.export` wrote; with a fifth of the learning rate."""
     trusted: Annotated[bool, arg(help=TRUSTED)] = False
     eval_scene: Annotated[tuple[str, ...] | None, arg(metavar="SCENE")] = None
     """Evaluate in these too, and keep the best model."""
@@ -154,7 +156,8 @@ def _environment(options: Train) -> Any:
 def _model(options: Train, env: Any) -> Any:
     arguments = {"seed": options.seed, **options.preset.arguments()}
     if options.start is not None:
-        return started_ppo(options.start, env, **arguments)
+        gentle = replace(options.preset, learning_rate=options.preset.learning_rate / _GENTLER)
+        return started_ppo(options.start, env, **(arguments | gentle.arguments()))
     if options.resume is None:
         from gymnasium import spaces
         from stable_baselines3 import PPO

@@ -1,4 +1,6 @@
-"""The whole chain on one room: train a policy, capture with it and with two baselines, reconstruct, score, compare.
+"""The whole chain on one room: capture with the policy that comes with the suite, and with it trained further here.
+
+Two baselines beside it; reconstruct, score, compare.
 
 The experiment's smallest preset. What is done is not done again, so an interrupted demo goes on where it was.
 """
@@ -15,13 +17,13 @@ from avp_habitat import command
 from avp_habitat.metrics import explained
 from avp_habitat.simulators.registry import SimulatorChoice
 
-METHODS = ("random", "heuristic", "proposed")
+METHODS = ("random", "heuristic", "pretrained", "pretrained_tuned")
 PRESET = PRESETS["demo"]
 
 
 @dataclass(frozen=True)
 class Demo:
-    """The whole chain on one room: train, capture, reconstruct, score, compare.
+    """The whole chain on one room that the policy of the suite has never seen: capture, train, reconstruct, compare.
 
     Takes about six minutes on two CPU cores.
     """
@@ -29,7 +31,7 @@ class Demo:
     scene: str = "builtin:0"
     """The room."""
     steps: int = PRESET.steps
-    """Environment steps of the training."""
+    """Environment steps for which the policy is trained further in the room."""
     iterations: int = PRESET.iterations
     """Of each reconstruction."""
     width: int = PRESET.size[0]

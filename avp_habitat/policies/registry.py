@@ -104,15 +104,14 @@ def exported_file(policy: Any) -> Path | None:
     return None if policy in others else weights_file(policy)
 
 
-def reward_of(policy: Any) -> str:
-    """The reward under which a policy acts where none is given: weights name theirs, else it is the task's default.
+def learned_reward(policy: Any) -> str | None:
+    """The reward from which a policy's weights learned, which decides when a stop ends the episode; None for others.
 
-    It decides when a stop ends the episode. A reward that is `module:object` has to be given, so that no file chooses
-    what is imported.
+    A reward that is `module:object` has to be given by the user, so that no file chooses what is imported.
     """
     weights = exported_file(policy)
     name = None if weights is None else read_facts(weights)["settings"].get("reward")
-    return name if name in REWARDS else str(TaskSettings.reward)
+    return name if name in plugins.names("avp.rewards", REWARDS) else None
 
 
 def make_policy(policy: Any, env: AVPEnv, seed: int, *, trusted: bool = False) -> Policy:
