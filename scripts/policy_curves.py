@@ -23,7 +23,7 @@ from avp_habitat import command
 from avp_habitat.command import progress
 from avp_habitat.errors import UsageError
 from avp_habitat.files import atomic_file, check_writable
-from avp_habitat.metrics import FIGURES
+from avp_habitat.metrics import FIGURES, mean_and_half_width
 from avp_habitat.policies.registry import POLICIES_HELP, TRUSTED, check_policy, make_policy_env, steps_of
 from avp_habitat.poses import Intrinsics
 from avp_habitat.provenance import PACKAGES, git_commit, installed_versions
@@ -188,7 +188,7 @@ def shown(options: PolicyCurves, done: Sequence[dict[str, Any]]) -> list[dict[st
 
 
 def rows_of(done: Sequence[dict[str, Any]], views: Sequence[int]) -> str:
-    """The cells as a Markdown table in percent; the worst start in brackets."""
+    """The cells as a Markdown table in percent, with 95 % intervals over the starts; the worst start in brackets."""
     titles = [f"{FIGURES[name].title} {count}" for name in SHARES for count in views]
     head = ["scene", "policy", "actions", "starts", "views", "stop", *titles]
     rows = []
@@ -196,8 +196,9 @@ def rows_of(done: Sequence[dict[str, Any]], views: Sequence[int]) -> str:
         cells = [str(entry[name]) for name in ("scene", "policy", "actions", "starts")]
         cells += [f"{entry['views_used']:.1f}", f"{100 * entry['stopped']:.0f}"]
         for name in SHARES:
-            pairs = zip(entry["mean"][name], entry["worst"][name], strict=True)
-            cells += [f"{100 * mean:.1f} ({100 * worst:.0f})" for mean, worst in pairs]
+            shares = 100 * np.array([episode[name] for episode in entry["episodes"]])
+            columns = zip(*mean_and_half_width(shares), shares.min(axis=0), strict=True)
+            cells += [f"{mean:.1f} ± {half:.1f} ({worst:.0f})" for mean, half, worst in columns]
         rows.append(cells)
     return table(head, rows, words=3)
 
@@ -235,7 +236,7 @@ def main(options: PolicyCurves) -> None:
             del simulator
     print(rows_of(shown(options, done), options.views))
     print(
-        "visibility and parallax in percent after so many views, mean (worst start); stop: share of episodes, percent"
+        "visibility and parallax in percent after so many views, mean ± 95 % interval (worst start); stop: share of episodes, percent"
     )
     print(f"{options.out}: {len(done)} cells")
 
