@@ -235,9 +235,8 @@ def main(options: PolicyCurves) -> None:
                 write(options, done)
             del simulator
     print(rows_of(shown(options, done), options.views))
-    print(
-        "visibility and parallax in percent after so many views, mean ± 95 % interval (worst start); stop: share of episodes, percent"
-    )
+    print("visibility and parallax in percent after so many views, mean ± 95 % interval (worst start)")
+    print("stop: share of episodes that the policy itself ended, percent")
     print(f"{options.out}: {len(done)} cells")
 
 
