@@ -59,8 +59,8 @@ def known_methods() -> dict[str, Method]:
 
 BASELINES = ("heuristic", "random", "frontier", "greedy", "oracle", "survey")
 """What learned policies are compared with by default; the last two plan with full knowledge."""
-DEFAULT = (*BASELINES, *REWARDS, f"proposed{ROOMS}", f"surface{ROOMS}")
-"""The baselines, every reward, and the rewards with a learned stop trained over many rooms."""
+DEFAULT = (*BASELINES, *REWARDS, f"proposed{ROOMS}", f"surface{ROOMS}", "pretrained")
+"""The baselines, every reward, rewards trained over many rooms, and the weights of the package."""
 
 
 def chosen_methods(names: Sequence[str]) -> tuple[Method, ...]:

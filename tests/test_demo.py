@@ -20,14 +20,14 @@ def demo(*words, folder):
 
 
 @pytest.mark.slow
-def test_the_demo_compares_three_methods_and_is_not_repeated(tmp_path):
+def test_the_demo_compares_four_methods_and_is_not_repeated(tmp_path):
     words = ("--out", "d", "--steps", 2048, "--iterations", 20, "--width", 40, "--height", 32)
     done = demo(*words, folder=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     head, _, *rows = [line for line in done.stdout.splitlines() if line.startswith("|")]
     assert "coverage [%]" in head
     assert "PSNR [dB]" in head
-    assert [row.split()[1] for row in rows] == ["heuristic", "random", "proposed"]
+    assert [row.split()[1] for row in rows] == ["heuristic", "random", "pretrained", "pretrained_tuned"]
     for row in rows:
         rollout = tmp_path / "d" / "cells" / "collect" / f"{row.split()[1]}-builtin_0-0-0" / "rollout"
         assert f" {100 * read_rollout(rollout).meta['metrics']['coverage']:.1f} " in row
@@ -36,7 +36,7 @@ def test_the_demo_compares_three_methods_and_is_not_repeated(tmp_path):
 
     again = demo(*words, folder=tmp_path)
     assert again.returncode == 0
-    assert "0 of 7 cells to do" in again.stdout
+    assert "0 of 9 cells to do" in again.stdout
     other = demo("--out", "d", "--steps", 4096, folder=tmp_path)
     assert other.returncode == 2
     assert "holds an experiment of another configuration" in other.stderr
