@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from avp_experiment.configuration import ROOMS, TRAIN, UNSEEN
+from avp_experiment.configuration import ROOMS, TRAIN, TUNED, UNSEEN
 from avp_experiment.results import Key, Results, Training
 from avp_experiment.statistics import PREDICTORS, Point, correlations, points_of, summary
 from avp_habitat.metrics import FIGURES
@@ -56,13 +56,17 @@ _STYLES = {
     "coverage_redundancy": ("#0072B2", "p"),
     "proposed": ("#D55E00", "o"),
     "surface": ("#661F77", "h"),
+    "multiview": ("#117733", "H"),
+    "survey-multiview": ("#332288", "d"),
+    "pretrained": ("#C1121F", "*"),
 }
 _OTHER = ("#A08060", "8")
 
 
 def style_of(method: str) -> tuple[str, str, str]:
-    """Colour, marker and line of a method; of one trained in generated rooms its reward's, dashed."""
-    return *_STYLES.get(method.removesuffix(ROOMS), _OTHER), "--" if method.endswith(ROOMS) else "-"
+    """Colour, marker and line of a method; of one trained in generated rooms its reward's, dashed, as are tuned weights."""
+    plain = method.removesuffix(ROOMS).removesuffix(TUNED)
+    return *_STYLES.get(plain, _OTHER), "-" if plain == method else "--"
 
 
 def new_figure(height_in: float) -> "Figure":
