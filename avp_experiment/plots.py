@@ -64,7 +64,7 @@ _OTHER = ("#A08060", "8")
 
 
 def style_of(method: str) -> tuple[str, str, str]:
-    """Colour, marker and line of a method; of one trained in generated rooms its reward's, dashed, as are tuned weights."""
+    """Colour, marker and line of a method; where trained in generated rooms, or tuned, those of what it is, dashed."""
     plain = method.removesuffix(ROOMS).removesuffix(TUNED)
     return *_STYLES.get(plain, _OTHER), "-" if plain == method else "--"
 

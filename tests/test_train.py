@@ -78,7 +78,8 @@ def test_the_training_script_trains_tracks_and_saves(tmp_path):
         (("--steps", 0), "--steps: expected a whole number from 1 to 1,000,000,000,000, got 0"),
         (
             ("--observation", "maps"),
-            "unknown observation 'maps': expected one of map, numbers, onboard, privileged, surface_map; did you mean 'map'?",
+            "unknown observation 'maps': expected one of map, numbers, onboard, privileged, surface_map; did you mean "
+            "'map'?",
         ),
         (("--resume", "no.zip"), "--resume no.zip: no such model file"),
         (("--resume", "runs:/1/model.zip"), "--resume runs:/1/model.zip: no MLflow database at sqlite:///"),
