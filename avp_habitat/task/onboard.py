@@ -106,9 +106,8 @@ class Privileged(Onboard):
 def _state(agents: Agents) -> NDArray[np.floating]:
     budget = agents.settings.budget
     columns = [agents.steps / budget, (budget - agents.steps) / 80.0, np.sin(agents.pitch), np.cos(agents.pitch)]
-    return np.column_stack(
-        [*columns, agents.min_depth, agents.mean_depth, agents.collided, agents.spread_m / _SPREAD_M]
-    )
+    columns += [agents.min_depth, agents.mean_depth, agents.collided * 1.0, agents.spread_m / _SPREAD_M]
+    return np.column_stack(columns)
 
 
 def _gains(trail: Trail, steps: NDArray[np.int64]) -> NDArray[np.floating]:

@@ -16,7 +16,7 @@ from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.motion import sensor_poses
 from avp_habitat.task.settings import TaskSettings
 
-Float = NDArray[np.floating]
+Float = NDArray[np.float64]
 
 FIRST, SECOND = 0.5, 0.5
 """What a point is worth once it is seen, and what more once a second ray to it stands `PARALLAX_DEG` from the first."""

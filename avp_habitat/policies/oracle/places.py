@@ -110,7 +110,7 @@ def scene_places(
     a cell that gives no more than `entries` pairs of a place and a cell.
     """
     area = simulator.area
-    points = np.asarray(_thinned(area.centres)) if sparse else area.centres
+    points: Float = np.asarray(_thinned(area.centres) if sparse else area.centres, dtype=np.float64)
     if surfaces:
         points = np.concatenate([points, surface_points(simulator, settings)])
     most = entries // len(points)
