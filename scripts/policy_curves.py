@@ -40,6 +40,10 @@ from avp_habitat.task.settings import TaskSettings
 ALIKE_BOTH_WAYS = ("heuristic", "random", "spin", "frontier", "greedy", "oracle", "survey", "survey-multiview")
 """Policies that have no likeliest action to take instead of a sampled one."""
 SHARES = ("visibility", "visibility_parallax")
+LEGEND = (
+    "Visibility and parallax in percent after so many views, mean ± 95 % interval (worst start); stop: share of "
+    "episodes that the policy itself ended, percent."
+)
 HELDOUT_WIDTH, HELDOUT_HEIGHT = 640, 480
 """Of the held-out views, so that the tested points are those of a rollout."""
 
@@ -214,8 +218,10 @@ def write(options: PolicyCurves, done: Sequence[dict[str, Any]]) -> None:
     }
     with atomic_file(options.out) as path:
         path.write_text(json.dumps({**about, "cells": list(done)}, indent=1) + "\n", encoding="utf-8")
+    made = f"`{about['command']}` (commit {about['commit']}, {about['machine']})"
+    page = ["# Policies by views", made, rows_of(shown(options, done), options.views), LEGEND]
     with atomic_file(options.out.with_suffix(".md")) as path:
-        path.write_text(rows_of(shown(options, done), options.views) + "\n", encoding="utf-8")
+        path.write_text("\n\n".join(page) + "\n", encoding="utf-8")
 
 
 def main(options: PolicyCurves) -> None:
@@ -235,8 +241,7 @@ def main(options: PolicyCurves) -> None:
                 write(options, done)
             del simulator
     print(rows_of(shown(options, done), options.views))
-    print("visibility and parallax in percent after so many views, mean ± 95 % interval (worst start)")
-    print("stop: share of episodes that the policy itself ended, percent")
+    print(LEGEND)
     print(f"{options.out}: {len(done)} cells")
 
 
