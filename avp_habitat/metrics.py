@@ -67,7 +67,7 @@ _ALL = (
     Figure("coverage", "coverage", "%", 100, better="higher", meaning=_SHARE),
     Figure("coverage_area", "coverage, mean over views", "%", 100, better="higher"),
     Figure("views", "views", better="lower", meaning="pictures taken, one for each step"),
-    Figure("stopped", "stop", "%", 100, meaning="the policy itself ended the episode, with enough coverage"),
+    Figure("stopped", "stop", "%", 100, meaning="the policy itself ended the episode"),
     Figure("cpv", "CpV", "%/view", 1, 2, "higher", "coverage per view, mean coverage over mean number of views"),
     Figure("annd_m", "ANND", "m", 1, 3, meaning=_NEAREST),
     Figure("ei", "EI", "%/view", 100, 2, "higher", "efficiency index, coverage over the number of pictures"),

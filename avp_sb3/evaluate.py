@@ -15,6 +15,7 @@ from avp_habitat.command import progress
 from avp_habitat.errors import UsageError
 from avp_habitat.files import check_new, check_writable
 from avp_habitat.metrics import METRICS_HELP
+from avp_habitat.plugins import name_of
 from avp_habitat.policies.registry import POLICIES_HELP, TRUSTED, check_policy, described, learned_reward
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.drawing import draw_trajectory
@@ -117,7 +118,7 @@ def _report(runners: Sequence[PolicyRunner], done: dict[str, list[Episode]], opt
         return
     env, episodes = runners[0].env, sum(map(len, done.values()))
     complete = episodes == len(done) * options.episodes
-    about = {"complete": complete, **_about(env, options)}
+    about = {"complete": complete, **_about(runners, options)}
     print(f"{table(results, options.metrics)}\n\n{LEGEND}\n")
     write_report(out, results, about, options.metrics)
     if not complete:
@@ -136,8 +137,10 @@ def _report(runners: Sequence[PolicyRunner], done: dict[str, list[Episode]], opt
     print(f"MLflow:  run {run} in experiment {experiment!r} at {store}")
 
 
-def _about(env: Any, options: Evaluate) -> dict[str, Any]:
+def _about(runners: Sequence[PolicyRunner], options: Evaluate) -> dict[str, Any]:
+    env = runners[0].env
     settings = env.settings.facts()
+    settings["reward"] = ", ".join(dict.fromkeys(name_of(runner.env.settings.reward) for runner in runners))
     del settings["observation"]  # Each policy has its own.
     return {
         "command": shlex.join(["python", "-m", "avp_sb3.evaluate", *sys.argv[1:]]),

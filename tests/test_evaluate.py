@@ -143,6 +143,18 @@ def test_a_report_reads_back_as_it_was_written(tmp_path, episodes):
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["r"]
 
 
+def test_a_figure_that_some_policies_lack_is_left_open_for_them(tmp_path):
+    mine, other = result(), result("other")
+    mine.figures["surface"] = np.array([0.1, 0.2, 0.3])
+    for pair in ([mine, other], [other, mine]):
+        row = next(row for row in table(pair).splitlines() if row.startswith("| surface"))
+        assert [cell.strip() for cell in row.strip("|").split("|")][1 + pair.index(other)] == "–"
+    written = write_report(tmp_path / "e", [other, mine], {})
+    rows = list(csv.DictReader((written / "episodes.csv").open()))
+    assert [row["surface"] for row in rows] == ["", "", "", "0.1", "0.2", "0.3"]
+    assert read_report(written)[0].figures.keys() == other.figures.keys()
+
+
 def test_a_damaged_report_is_named(tmp_path):
     folder = write_report(tmp_path / "r", [result()], {})
     path = folder / "evaluation.json"

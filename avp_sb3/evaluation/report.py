@@ -21,6 +21,7 @@ JSON_FILE, CSV_FILE, TABLE_FILE, PLOT_FILE = "evaluation.json", "episodes.csv", 
 FORMAT, FORMAT_VERSION = "avp-evaluation", 1
 LEGEND = f"{explained('coverage', 'ANND', 'EI', 'CpV', 'redundant views', 'stop')}; ±: half of the 95 % interval"
 """One line to print below a table."""
+_NONE = "–"
 _VERSIONED = ("avp-suite", "stable-baselines3", "torch", "gymnasium", "numpy", "open3d", "scipy")
 
 
@@ -39,18 +40,25 @@ def table(results: Sequence[PolicyResult], metrics: Iterable[Any] = ()) -> str:
 
 def cells(results: Sequence[PolicyResult], metrics: Iterable[Any] = ()) -> dict[str, list[str]]:
     """By the heading of a figure, its text for each policy; arguments as of `table`."""
-    present = results[0].figures
-    known = figures_of(metrics)
+    present, known = names_of(results), figures_of(metrics)
     # Whoever reads a report may not have the metrics that its figures are of.
     known |= {name: Figure(name, name, digits=3) for name in present if name not in known}
     shown = {
-        figure.heading: [figure.text(*map(float, mean_and_half_width(each.figures[name]))) for each in results]
+        figure.heading: [
+            figure.text(*map(float, mean_and_half_width(each.figures[name]))) if name in each.figures else _NONE
+            for each in results
+        ]
         for name, figure in known.items()
         if name in present
     }
     ratio = known["cpv"]
     episodes = [str(len(result.seeds)) for result in results]
     return shown | {ratio.heading: [ratio.text(cpv(result)) for result in results], "episodes": episodes}
+
+
+def names_of(results: Sequence[PolicyResult]) -> list[str]:
+    """The figures of all policies: some are known only under the reward by which one acts."""
+    return list(dict.fromkeys(name for result in results for name in result.figures))
 
 
 def cpv(result: PolicyResult) -> float:
@@ -148,10 +156,12 @@ def _result(entry: Mapping[str, Any]) -> PolicyResult:
 def _write_csv(path: Path, results: Sequence[PolicyResult]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(["policy", "seed", *results[0].figures])
+        names = names_of(results)
+        writer.writerow(["policy", "seed", *names])
         for result in results:
-            for seed, *values in zip(result.seeds, *result.figures.values(), strict=True):
-                writer.writerow([result.policy, seed, *(f"{value:.9g}" for value in values)])
+            for row, seed in enumerate(result.seeds):
+                values = [f"{result.figures[name][row]:.9g}" if name in result.figures else "" for name in names]
+                writer.writerow([result.policy, seed, *values])
 
 
 def _plot(path: Path, results: Sequence[PolicyResult]) -> None:
