@@ -27,7 +27,7 @@ def test_the_demo_compares_four_methods_and_is_not_repeated(tmp_path):
     head, _, *rows = [line for line in done.stdout.splitlines() if line.startswith("|")]
     assert "coverage [%]" in head
     assert "PSNR [dB]" in head
-    assert [row.split()[1] for row in rows] == ["heuristic", "random", "pretrained", "pretrained_tuned"]
+    assert {row.split()[1] for row in rows} == {"heuristic", "random", "pretrained", "pretrained_tuned"}
     for row in rows:
         rollout = tmp_path / "d" / "cells" / "collect" / f"{row.split()[1]}-builtin_0-0-0" / "rollout"
         assert f" {100 * read_rollout(rollout).meta['metrics']['coverage']:.1f} " in row
