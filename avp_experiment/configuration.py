@@ -74,12 +74,14 @@ def chosen_methods(names: Sequence[str]) -> tuple[Method, ...]:
     if not names:
         raise UsageError("methods: expected at least one, got none")
     known = known_methods()
-    exported = {name: None for name in names if exported_file(name.removesuffix(TUNED)) is not None}
+    # In this order: a folder may be called like a reward.
+    unknown = [name for name in names if name not in known]
+    exported = dict.fromkeys(name for name in unknown if exported_file(name.removesuffix(TUNED)) is not None)
     for name in names:
         if ":" not in name and name not in known and name not in exported:
             raise unknown_name("method", name, known)
     chosen = [method for name, method in known.items() if name in names]
-    for name in (name for name in exported if name not in known):
+    for name in exported:
         tuned = name.endswith(TUNED)
         chosen.append(Method(name.removesuffix(TUNED), learned=tuned, tuned=tuned))
     for name in dict.fromkeys(name for name in names if ":" in name and name not in exported):

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from avp_sb3.callbacks.metrics import MetricsCallback
     from avp_sb3.callbacks.mlflow import MLflowCallback
     from avp_sb3.callbacks.rerun import RerunCallback
+    from avp_sb3.callbacks.stopping import StopCallback
     from avp_sb3.evaluation.policy import PolicyResult, evaluate_policy
     from avp_sb3.vec_env.batched import AVPVecEnv
     from avp_sb3.vec_env.subproc import AVPSubprocVecEnv
@@ -20,6 +21,7 @@ __all__ = [
     "MetricsCallback",
     "PolicyResult",
     "RerunCallback",
+    "StopCallback",
     "evaluate_policy",
 ]
 
@@ -30,6 +32,7 @@ _HOME = {
     "MetricsCallback": "avp_sb3.callbacks.metrics",
     "MLflowCallback": "avp_sb3.callbacks.mlflow",
     "RerunCallback": "avp_sb3.callbacks.rerun",
+    "StopCallback": "avp_sb3.callbacks.stopping",
     "PolicyResult": "avp_sb3.evaluation.policy",
     "evaluate_policy": "avp_sb3.evaluation.policy",
 }

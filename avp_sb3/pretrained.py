@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from avp_habitat import command
 from avp_habitat.policies.weights import DEFAULT, PRETRAINED, available
 from avp_habitat.policies.weights.format import read_weights
+from avp_habitat.tables import table
 
 
 @dataclass(frozen=True)
@@ -19,17 +20,15 @@ def main(options: Pretrained) -> None:
     if not there:
         print("this copy of avp-suite has no pretrained weights; `python -m avp_sb3.export` makes some of a model")
         return
-    rows = [("policy", "version", "observation", "inputs", "steps", "SHA-256")]
+    head, rows = ("policy", "version", "observation", "inputs", "steps", "SHA-256"), []
     for name, path in there.items():
         weights = read_weights(path)
         steps = weights.training.get("steps")
-        told = "" if steps is None else f"{steps:,}"
         shape = "x".join(map(str, weights.shape))
         marked = f"{PRETRAINED}:{name}" + (f" (= {PRETRAINED})" if name == DEFAULT else "")
+        told = "" if steps is None else f"{steps:,}"
         rows.append((marked, str(weights.version), weights.observation, shape, told, weights.sha256[:12]))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    print(table(head, rows, markdown=False))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from avp_habitat import command
 from avp_habitat.errors import UsageError
 from avp_habitat.files import check_writable
 from avp_habitat.metrics import METRICS_HELP
-from avp_habitat.policies.registry import TRUSTED, load_model
+from avp_habitat.policies.registry import TRUSTED, learned_reward, load_model
 from avp_habitat.policies.saved_model import is_normalised, load_statistics, statistics_of
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.scenes.location import HELP as SCENES
@@ -22,7 +22,7 @@ from avp_habitat.simulators.registry import SimulatorChoice
 from avp_habitat.task.rewards import REWARDS_HELP, find_reward, stops_always
 from avp_habitat.task.settings import OBSERVATIONS_HELP, STOP, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
-from avp_sb3.exchange.sb3 import note_training, start_observation, started_ppo
+from avp_sb3.exchange.sb3 import note_training, start_file, start_observation, started_ppo
 from avp_sb3.presets import MAP, PRESETS, PPOPreset
 from avp_sb3.vec_env.pool import TURNOVER, describe
 
@@ -50,7 +50,7 @@ class Train:
     """With rooms or homes: so many scenes are open at a time, over all workers."""
     turnover: Annotated[int, Range(1, _MOST)] = TURNOVER
     """With rooms or homes: a scene is held for the steps of so many whole episodes."""
-    reward: Annotated[str, arg(help=REWARDS_HELP)] = "proposed"
+    reward: Annotated[str | None, arg(help=f"{REWARDS_HELP} (omitted: proposed, or that of --start)")] = None
     observation: Annotated[
         str | None,
         arg(help=f"{OBSERVATIONS_HELP}; also chooses PPO's settings (omitted: numbers, or that of --start)"),
@@ -96,11 +96,13 @@ class Train:
         hold_ranges(self)
         if self.start is not None and self.resume is not None:
             raise UsageError("start: expected one of --start and --resume, got both")
-        # A training's observation is known from here on, so that nothing else asks where it came from.
-        kind = "numbers" if self.observation is None else self.observation
-        object.__setattr__(
-            self, "observation", kind if self.start is None else start_observation(self.start, self.observation)
-        )
+        # Both are known from here on, so that nothing else asks where they came from.
+        kind, reward = self.observation or "numbers", TaskSettings.reward
+        if self.start is not None:
+            kind = start_observation(self.start, self.observation)
+            reward = learned_reward(str(start_file(self.start))) or reward
+        object.__setattr__(self, "observation", kind)
+        object.__setattr__(self, "reward", self.reward or reward)
         _ = self.settings, self.preset
 
     @property
@@ -124,7 +126,7 @@ class Train:
     def settings(self) -> TaskSettings:
         """Of the task."""
         return TaskSettings(
-            reward=self.reward,
+            reward=str(self.reward),
             observation=self.observation,
             metrics=self.metrics,
             lookup=not (self.rays or self.pooled) and self.simulator.single_rays,
@@ -211,8 +213,7 @@ def _resumed_file(resume: str, folder: str) -> Path:
 
 
 def _callbacks(options: Train, tracking: Any) -> list[Any]:
-    from avp_sb3 import EvaluationCallback, MetricsCallback, RerunCallback
-    from avp_sb3.callbacks.stopping import StopCallback
+    from avp_sb3 import EvaluationCallback, MetricsCallback, RerunCallback, StopCallback
 
     callbacks: list[Any] = []
     # First, so that scenes that cannot be opened leave no empty run behind.
@@ -221,7 +222,7 @@ def _callbacks(options: Train, tracking: Any) -> list[Any]:
         where: dict[str, Any] = vars(options.simulator) | {"navmesh": None}  # That is the training scene's.
         callbacks.append(EvaluationCallback(options.eval_scene, every=options.eval_every, best_model=best, **where))
     callbacks += [MetricsCallback(), tracking]
-    if stops_always(find_reward(options.reward)):
+    if stops_always(find_reward(str(options.reward))):
         callbacks.append(StopCallback())
     if options.recording is not None:
         callbacks.append(RerunCallback(options.recording))

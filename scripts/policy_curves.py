@@ -24,7 +24,8 @@ from avp_habitat.command import progress
 from avp_habitat.errors import UsageError
 from avp_habitat.files import atomic_file, check_writable
 from avp_habitat.metrics import FIGURES, mean_and_half_width
-from avp_habitat.policies.registry import POLICIES_HELP, TRUSTED, check_policy, make_policy_env, steps_of
+from avp_habitat.policies.registry import POLICIES, POLICIES_HELP, TRUSTED, check_policy, make_policy_env, steps_of
+from avp_habitat.policies.weights import PRETRAINED
 from avp_habitat.poses import Intrinsics
 from avp_habitat.provenance import PACKAGES, git_commit, installed_versions
 from avp_habitat.ranges import Range, hold_ranges
@@ -37,7 +38,7 @@ from avp_habitat.tables import table
 from avp_habitat.task.rewards import REWARDS_HELP
 from avp_habitat.task.settings import TaskSettings
 
-ALIKE_BOTH_WAYS = ("heuristic", "random", "spin", "frontier", "greedy", "oracle", "survey", "survey-multiview")
+ALIKE_BOTH_WAYS = POLICIES.keys() - {PRETRAINED}
 """Policies that have no likeliest action to take instead of a sampled one."""
 SHARES = ("visibility", "visibility_parallax")
 LEGEND = (
@@ -61,7 +62,7 @@ class PolicyCurves:
     """Episodes of each policy in each scene, all policies from the same starts."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 1000
     """Of the first start; episode i uses SEED + i."""
-    reward: Annotated[str, arg(help=f"whose stop action counts: {REWARDS_HELP}")] = "surface"
+    reward: Annotated[str, arg(help=f"whose stop action counts: {REWARDS_HELP}")] = "multiview"
     budget: int = 80
     """Steps, which are views."""
     views: tuple[int, ...] = (20, 40, 60, 80)

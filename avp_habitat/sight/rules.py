@@ -38,6 +38,15 @@ def in_camera(pose, point):
 
 
 @njit(cache=True)
+def turned(x, z, sine, cosine):
+    """How far ahead and how far to the right an offset on the floor lies, by the sine and cosine of a yaw.
+
+    Seen from above: yaw 0 looks along -z, left is positive. With both divided by a length, that is the unit.
+    """
+    return -x * sine - z * cosine, x * cosine - z * sine
+
+
+@njit(cache=True)
 def in_image(right, up, ahead, camera):
     """Whether a point lies before the camera and inside its image; the right and the lower border are outside."""
     width, height, fx, fy, cx, cy = camera

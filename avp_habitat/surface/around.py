@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.compiled import njit
+from avp_habitat.sight.rules import quality, turned
 from avp_habitat.surface.points import EDGE_M, SceneSurface
 
 SIDE = 10
@@ -33,7 +34,7 @@ _UPRIGHT = np.sqrt(0.5)
 
 def look_around(
     surface: SceneSurface,
-    quality: NDArray[np.float32],
+    best: NDArray[np.float32],
     pair: NDArray[np.float32],
     rows: NDArray[np.integer],
     eye: NDArray[np.floating],
@@ -43,7 +44,7 @@ def look_around(
 
     Args:
         surface: m points of their scene.
-        quality: `(n, m)` how well each was seen so far, 0 for never.
+        best: `(n, m)` how well each was seen so far, 0 for never.
         pair: `(n, m)` how well along two rays.
         rows: `(k,)` the agents' rows of both.
         eye: `(k, 3)` their cameras, metres.
@@ -55,7 +56,7 @@ def look_around(
     """
     maps = np.zeros((len(rows), len(CHANNELS), SIDE, SIDE), dtype=np.float32)
     polar = np.zeros((len(rows), 2, len(BANDS), SECTORS), dtype=np.float32)
-    _look(surface.points, surface.normals, quality, pair, rows, np.asarray(eye), np.asarray(yaw), maps, polar)
+    _look(surface.points, surface.normals, best, pair, rows, np.asarray(eye), np.asarray(yaw), maps, polar)
     maps[:, 1::2] /= np.maximum(maps[:, ::2], 1.0)
     maps[:, ::2] /= FULL
     polar[:, 0] *= EDGE_M**2 / FULL_SOLID_ANGLE
@@ -64,15 +65,15 @@ def look_around(
 
 
 @njit(cache=True)
-def _look(points, normals, quality, pair, rows, eye, yaw, maps, polar):
+def _look(points, normals, best, pair, rows, eye, yaw, maps, polar):
     side, sectors = maps.shape[3], polar.shape[3]
     for k in range(len(rows)):
-        seen = quality[rows[k]]
-        ahead_x, ahead_z = -np.sin(yaw[k]), -np.cos(yaw[k])
+        seen = best[rows[k]]
+        sine, cosine = np.sin(yaw[k]), np.cos(yaw[k])
         for j in range(len(points)):
             if seen[j] > 0:
                 x, y, z = points[j, 0] - eye[k, 0], points[j, 1] - eye[k, 1], points[j, 2] - eye[k, 2]
-                ahead, right = x * ahead_x + z * ahead_z, z * ahead_x - x * ahead_z
+                ahead, right = turned(x, z, sine, cosine)
                 row, column = int(np.floor(side / 2 - ahead / CELL_M)), int(np.floor(side / 2 + right / CELL_M))
                 if 0 <= row < side and 0 <= column < side:
                     channel = 0 if abs(normals[j, 1]) < _UPRIGHT else 2
@@ -86,7 +87,7 @@ def _look(points, normals, quality, pair, rows, eye, yaw, maps, polar):
                     band = 0 if y < -level else (2 if y > level else 1)
                     sector = int(turn(ahead, right) * sectors + 0.5)
                     distance = np.sqrt(square)
-                    value = facing / distance * min(1.0, 2.0 / distance)
+                    value = quality(eye[k], points[j], normals[j])
                     # A point stands for its cube, which from near is wider than a sector.
                     wide = int(min(0.5 * EDGE_M / distance, 0.5) / (2 * np.pi / sectors) + 0.5)
                     known = facing / (distance * square) / (2 * wide + 1)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avp_habitat.compiled import njit
+from avp_habitat.sight.rules import turned
 from avp_habitat.surface.points import SceneSurface
 
 SIDE = 10
@@ -70,11 +71,11 @@ def _draw(points, facing, quality, rows, eye, yaw, maps):
     side = maps.shape[3]
     for k in range(len(rows)):
         seen = quality[rows[k]]
-        ahead_x, ahead_z = -np.sin(yaw[k]) / CELL_M, -np.cos(yaw[k]) / CELL_M
+        sine, cosine = np.sin(yaw[k]) / CELL_M, np.cos(yaw[k]) / CELL_M
         for j in range(len(points)):
             if seen[j] > 0:
                 x, z = points[j, 0] - eye[k, 0], points[j, 2] - eye[k, 2]
-                ahead, right = x * ahead_x + z * ahead_z, z * ahead_x - x * ahead_z
+                ahead, right = turned(x, z, sine, cosine)
                 row, column = int(np.floor(side / 2 - ahead)), int(np.floor(side / 2 + right))
                 if 0 <= row < side and 0 <= column < side:
                     group = _group(facing[j], points[j, 1] - eye[k, 1])

@@ -91,10 +91,6 @@ class RoomSurface:
         """`(m,)` how well one agent has seen each point of its scene's surface, within [0, 1]."""
         return self._quality[self._row[row]]
 
-    def parallax(self, row: int) -> NDArray[np.float32]:
-        """`(m,)` how well one agent has seen each point along two rays, within [0, 1]."""
-        return self._pair[self._row[row]]
-
     def shares(self, rows: Rows) -> NDArray[np.float64]:
         """`(k, 2)` ΣQ and ΣS by the sum of the best qualities in the scene, which no agent knows, at most 1."""
         return np.minimum(self._reached[self._row[rows]] / self._surface.best.sum(), 1.0)

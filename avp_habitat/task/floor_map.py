@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from avp_habitat.compiled import njit
 from avp_habitat.navigation.area import NavigableArea
+from avp_habitat.sight.rules import turned
 
 SIDE = 20
 """Map cells along a side; the agent stands in the middle, its heading points to row 0."""
@@ -33,12 +34,12 @@ def draw(index, first_seen, rows, place, yaw, scale, maps):
     """
     for k in range(len(rows)):
         seen = first_seen[rows[k]]
-        ahead_x, ahead_z = -np.sin(yaw[k]) / scale, -np.cos(yaw[k]) / scale
+        sine, cosine = np.sin(yaw[k]) / scale, np.cos(yaw[k]) / scale
         for i in range(1, index.shape[0] - 1):
             for j in range(1, index.shape[1] - 1):
                 if index[i, j] >= 0 and seen[index[i, j]] != 0:
                     x, z = j - 0.5 - place[k, 0], i - 0.5 - place[k, 1]
-                    ahead, right = x * ahead_x + z * ahead_z, z * ahead_x - x * ahead_z
+                    ahead, right = turned(x, z, sine, cosine)
                     _enter(maps[k], ahead, right, *_edges(index, seen, i, j))
 
 

@@ -9,6 +9,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from avp_habitat.compiled import njit
+from avp_habitat.sight.rules import turned
 from avp_habitat.surface import around
 from avp_habitat.task import floor_map
 from avp_habitat.task.observations import Agents, Trail
@@ -135,10 +136,10 @@ def _count_views(path, angles, steps, here, views):
     for k in range(len(steps)):
         now = steps[k]
         yaw = angles[k, now, 0]
-        ahead_x, ahead_z = -np.sin(yaw), -np.cos(yaw)
+        sine, cosine = np.sin(yaw), np.cos(yaw)
         for t in range(1, now + 1):
             x, z = path[k, t, 0] - path[k, now, 0], path[k, t, 2] - path[k, now, 2]
-            ahead, right = x * ahead_x + z * ahead_z, z * ahead_x - x * ahead_z
+            ahead, right = turned(x, z, sine, cosine)
             row = int(np.floor(side / 2 - ahead / around.CELL_M))
             column = int(np.floor(side / 2 + right / around.CELL_M))
             if 0 <= row < side and 0 <= column < side:
