@@ -227,6 +227,19 @@ def test_the_configuration_that_is_kept_is_readable(tmp_path):
     assert [scene["role"] for scene in found["scenes"]] == ["train", "unseen"]
 
 
+def test_weights_are_methods_as_they_are_and_tuned_and_folders_called_like_rewards_are_none(tmp_path, monkeypatch):
+    (tmp_path / "surface").mkdir()
+    monkeypatch.chdir(tmp_path)
+    methods = chosen_methods(("pretrained_tuned", "surface", "pretrained"))
+    assert [(method.name, method.learned, method.reward) for method in methods] == [
+        ("pretrained", False, "multiview"),
+        ("surface", True, "surface"),
+        ("pretrained_tuned", True, "multiview"),
+    ]
+    cell = next(each for each in plan(configuration(("pretrained_tuned",)), tmp_path, tracking="avp"))
+    assert "--start pretrained" in cell.command
+
+
 def test_every_method_has_a_style_of_its_own():
     styles = [style_of(method) for method in known_methods()]
     assert len(set(styles)) == len(styles)

@@ -232,8 +232,12 @@ def test_a_training_starts_from_actor_critic_and_statistics(folder):
     assert not np.array_equal(made.actor[0].weight, before.policy.mlp_extractor.policy_net[0].weight.detach())
 
 
-def test_a_training_takes_the_observation_of_its_start(folder):
+def test_a_training_takes_observation_and_reward_of_its_start(folder):
     assert Train(start=str(folder)).observation == "numbers"
+    packaged = Train(start="pretrained")
+    assert (packaged.observation, packaged.reward) == ("onboard", "multiview")
+    assert Train(start="pretrained", reward="surface").reward == "surface"
+    assert Train().reward == "proposed"
     with pytest.raises(UsageError, match="was made for numbers, got map"):
         Train(start=str(folder), observation="map")
     with pytest.raises(UsageError, match="expected one of --start and --resume"):
