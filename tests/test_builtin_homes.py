@@ -1,12 +1,10 @@
 import hashlib
-import os
-import subprocess
-import sys
 from functools import cache
 from itertools import combinations
 
 import numpy as np
 import pytest
+from test_builtin_rooms import printed_elsewhere
 
 from avp_habitat.errors import SceneError, UsageError
 from avp_habitat.poses import Intrinsics, camera_to_world
@@ -61,15 +59,8 @@ def standing_in(shell, points):
 
 
 def test_another_process_makes_the_same_home():
-    code = (
-        "import sys; sys.path.insert(0, 'tests'); from test_builtin_homes import digest, generate_home; "
-        "print(digest(generate_home(5)))"
-    )
-    environment = {**os.environ, "PYTHONHASHSEED": "7"}
-    printed = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
-    ).stdout
-    assert printed.strip() == digest(mesh_of(5))
+    code = "from test_builtin_homes import digest, generate_home; print(digest(generate_home(5)))"
+    assert printed_elsewhere(code) == digest(mesh_of(5))
 
 
 def test_seed_5_is_still_the_home_of_its_version():

@@ -64,16 +64,16 @@ def test_the_same_seed_gives_the_same_bytes():
     assert digest(generate_room(1)) == digest(room(1))
 
 
-def test_another_process_makes_the_same_room():
-    code = (
-        "import sys; sys.path.insert(0, 'tests'); from test_builtin_rooms import digest, generate_room; "
-        "print(digest(generate_room(1)))"
-    )
+def printed_elsewhere(code):
+    """What a line of Python prints in another process, which finds the tests."""
+    line = [sys.executable, "-c", f"import sys; sys.path.insert(0, 'tests'); {code}"]
     environment = {**os.environ, "PYTHONHASHSEED": "7"}
-    printed = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
-    ).stdout
-    assert printed.strip() == digest(room(1))
+    return subprocess.run(line, capture_output=True, text=True, check=True, env=environment).stdout.strip()
+
+
+def test_another_process_makes_the_same_room():
+    code = "from test_builtin_rooms import digest, generate_room; print(digest(generate_room(1)))"
+    assert printed_elsewhere(code) == digest(room(1))
 
 
 def test_seed_0_is_still_the_room_of_generator_version_1():
