@@ -237,6 +237,7 @@ def test_what_the_places_differ_on_is_returned_and_what_all_see_is_entered(room)
     camera, count = Intrinsics(40, 90, 50.0, 60.0, 12.0, 70.0), 60
     views, centres = views_at(room.area, count, seed=5), room.area.centres
     pose, normals = views.camera_to_world, np.tile([0.0, 1.0, 0.0], (len(centres), 1))
+    shown = np.linspace(0, 2, len(centres))
     inside = candidates(pose, camera, centres, np.ones((count, len(centres)), bool), max_range_m=4.0)
     assert len(inside) > len(centres)  # more than there is room for at first
     quality = view_quality(pose[:, :3, 3], centres, normals)[tuple(inside.T)].astype(np.float32)
@@ -251,9 +252,10 @@ def test_what_the_places_differ_on_is_returned_and_what_all_see_is_entered(room)
         best = np.zeros((count, len(centres)), np.float32)
         pairing = np.zeros((count, 0), np.float32), np.zeros((count, 0, 0), np.uint64), np.zeros((count, 1, 3))
         memory = rows, best, pairing, np.zeros(count, np.int64)
-        grown, _, values = new_surface(pack(members), slots, pose, centres, normals, numbers, 4.0, *memory)
+        grown, _, values = new_surface(pack(members), slots, pose, centres, normals, shown, numbers, 4.0, *memory)
         np.testing.assert_allclose(best[tuple(inside.T)] if sure else values, quality, rtol=1e-6)
-        assert grown.sum() == pytest.approx(quality.sum() if sure else 0, rel=1e-4)
+        assert grown[:, 0].sum() == pytest.approx(quality.sum() if sure else 0, rel=1e-4)
+        assert grown[:, 2].sum() == pytest.approx(quality @ shown[inside[:, 1]] if sure else 0, rel=1e-4)
 
 
 def test_tables_live_as_long_as_their_simulator_and_no_longer():

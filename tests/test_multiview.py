@@ -38,6 +38,7 @@ def pairs_by_hand(points, qualities, eyes):
 
 def test_parallax_grows_by_the_best_pair_of_all_frames_so_far(corridor):
     task, surface = ViewpointTask(corridor, SETTINGS, agents=2), scene_surface(corridor, SETTINGS)
+    shown, best_sum = surface.shown, (surface.shown * surface.best).sum()
     task.reset(range(2), corridor.area.centres[FEET], YAW)
     qualities, eyes, before, best = ([], []), ([], []), np.zeros(2), np.zeros(2)
     for t, action in enumerate(WALK):
@@ -46,12 +47,14 @@ def test_parallax_grows_by_the_best_pair_of_all_frames_so_far(corridor):
             pose = task.camera_to_world[i]
             qualities[i].append(seen_by_hand(SETTINGS, corridor, surface, pose))
             eyes[i].append(pose[:3, 3])
-            after = pairs_by_hand(surface.points, qualities[i], eyes[i]).sum()
-            single = np.max(qualities[i], axis=0).sum()
-            assert facts.new_parallax[i] == pytest.approx(after - before[i], abs=2e-3)
-            assert facts.new_surface[i] == pytest.approx(single - best[i], abs=2e-3)
-            assert facts.parallax[i] == pytest.approx(after / surface.best.sum(), abs=1e-4)
-            assert facts.surface[i] == pytest.approx(min(single / surface.best.sum(), 1), abs=1e-4)
+            after = shown @ pairs_by_hand(surface.points, qualities[i], eyes[i])
+            every = np.max(qualities[i], axis=0)
+            single = shown @ every
+            assert facts.new_shown_twice[i] == pytest.approx(after - before[i], abs=2e-3)
+            assert facts.new_shown[i] == pytest.approx(single - best[i], abs=2e-3)
+            assert facts.shown_twice[i] == pytest.approx(after / best_sum, abs=1e-4)
+            assert facts.shown[i] == pytest.approx(single / best_sum, abs=1e-4)
+            assert facts.surface[i] == pytest.approx(every.sum() / surface.best.sum(), abs=1e-4)
             before[i], best[i] = after, single
     assert (before > 4).all()
 
@@ -65,24 +68,23 @@ def test_tables_and_rays_agree_on_parallax(budget):
         task = ViewpointTask(room, TaskSettings(reward="multiview", budget=budget, lookup=lookup), agents=3)
         task.reset(range(3), start, np.zeros(3))
         facts = [task.step(action).facts for action in actions]
-        totals.append([np.sum([each.new_parallax for each in facts], axis=0), facts[-1].parallax])
+        totals.append([np.sum([each.new_shown_twice for each in facts], axis=0), facts[-1].shown_twice])
     np.testing.assert_allclose(totals[0], totals[1], rtol=0.01)
     assert totals[0][1].min() > 0.01
 
 
 def test_the_reward_weighs_both_growths_and_stop_ends_the_episode_at_any_time(corridor):
-    constants = replace(SETTINGS.constants, single_weight=0.3)
+    constants = replace(SETTINGS.constants, single_weight=0.2)
     task = ViewpointTask(corridor, replace(SETTINGS, constants=constants), agents=1)
     task.reset([0], corridor.area.centres[[100]], np.zeros(1))
     for action in (0, 1, 0):
         outcome = task.step(np.array([action]))
         facts = outcome.facts
-        amount = (0.3 * facts.new_surface + 0.7 * facts.new_parallax) ** 0.9
-        alpha = constants.alpha_multiview / (1 + 0.5 * facts.earlier_visits)
-        assert outcome.parts["multiview"] == pytest.approx(alpha * amount)
+        amount = (0.2 * facts.new_shown + 0.8 * facts.new_shown_twice) ** 0.9
+        assert outcome.parts["multiview"] == pytest.approx(constants.alpha_multiview * amount)
         assert not outcome.terminated
     outcome = task.step(np.array([STOP]))
-    share = 0.3 * outcome.facts.surface + 0.7 * outcome.facts.parallax
+    share = 0.2 * outcome.facts.shown + 0.8 * outcome.facts.shown_twice
     assert outcome.terminated
     assert outcome.parts["stop"] == pytest.approx(constants.stop_surface_bonus * share)
     assert outcome.facts.coverage < 0.85
@@ -113,7 +115,7 @@ def test_what_a_robot_does_not_know_changes_nothing(corridor):
 def _shown(task):
     rows = np.array([0])
     shown = task._shown(rows, lambda room, there: room.sensor.look(task._views(there)))
-    return shown, task._facts(np.array([0]), shown.new_cells, np.zeros((1, 2))).spread_m
+    return shown, task._facts(np.array([0]), shown.new_cells, np.zeros((1, 2, 4))).spread_m
 
 
 def test_a_robots_parts_say_what_they_are_called(corridor):

@@ -62,9 +62,11 @@ def random_facts(seed, n=6):
         stop_chosen=rng.random(n) < 0.5,
         coverage=rng.uniform(0.6, 1.0, n),
         steps_left=rng.integers(0, 80, n),
-        new_parallax=rng.uniform(0, 90, n),
+        new_shown=rng.uniform(0, 150, n),
+        new_shown_twice=rng.uniform(0, 90, n),
         surface=rng.uniform(0, 1, n),
-        parallax=rng.uniform(0, 1, n),
+        shown=rng.uniform(0, 1, n),
+        shown_twice=rng.uniform(0, 1, n),
     )
 
 
@@ -89,9 +91,9 @@ def by_hand(name, facts, i):
         stop = c.stop_surface_bonus * float(facts.surface[i]) if facts.stop_chosen[i] else 0.0
     elif name == "multiview":
         w = c.single_weight
-        grown = w * float(facts.new_surface[i]) + (1 - w) * float(facts.new_parallax[i])
-        new = {"multiview": c.alpha_multiview / discount * grown**c.beta}
-        share = w * float(facts.surface[i]) + (1 - w) * float(facts.parallax[i])
+        grown = w * float(facts.new_shown[i]) + (1 - w) * float(facts.new_shown_twice[i])
+        new = {"multiview": c.alpha_multiview * grown**c.beta}
+        share = w * float(facts.shown[i]) + (1 - w) * float(facts.shown_twice[i])
         stop = c.stop_surface_bonus * share if facts.stop_chosen[i] else 0.0
     else:
         new = {"coverage": c.alpha_proposed / discount * int(facts.new_cells[i]) ** c.beta}

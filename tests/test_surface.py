@@ -1,6 +1,8 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from corridor import ROOM, WALL, Corridor
+from corridor import ROOM, WALL, Corridor, reached
 
 from avp_habitat import poses
 from avp_habitat.errors import UsageError
@@ -9,7 +11,7 @@ from avp_habitat.sight.rules import view_quality
 from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.surface.map import CELL_M, FULL, GROUPS, SIDE, SurfaceMapper
 from avp_habitat.surface.memory import surface_tables
-from avp_habitat.surface.points import EDGE_M, SceneSurface, scene_surface
+from avp_habitat.surface.points import EDGE_M, scene_surface
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.settings import TaskSettings
 from avp_habitat.task.task import ViewpointTask
@@ -54,6 +56,22 @@ def test_there_is_one_point_for_a_cube_and_a_direction_and_hardly_a_cube_without
     # 6 m x 3 m: the ceiling has 24 x 12 cubes, less those over the wall.
     ceiling = (axis == 1) & (side < 0)
     assert 0.9 * 24 * 12 <= np.count_nonzero(ceiling) <= 24 * 12
+
+
+def test_points_weigh_as_their_patches_fill_level_pictures():
+    """Against the solid angles of patches of equal size, from other places than those at which pictures were taken."""
+    surface, size = scene_surface(SIMULATOR, SETTINGS), 0.0
+    for place in SIMULATOR.area.centres[::7]:
+        eye = place + [0, SETTINGS.sensor_height_m, 0]
+        ray = surface.points - eye
+        far, level = np.linalg.norm(ray, axis=1), np.hypot(ray[:, 0], ray[:, 2])
+        pairs = np.column_stack([np.zeros(len(ray), int), np.arange(len(ray))])
+        seen = reached(eye[None], surface.points, pairs, 0.01) & (np.abs(ray[:, 1]) < 0.8 * level)
+        size += seen * np.maximum(-(ray * surface.normals).sum(axis=1), 0) / far**3
+    assert surface.shown.mean() == pytest.approx(1)
+    assert np.corrcoef(size, surface.shown)[0, 1] > 0.75
+    wall, ceiling = np.abs(surface.points[:, 1] - SETTINGS.sensor_height_m) < 0.3, surface.normals[:, 1] < -0.9
+    assert surface.shown[wall].mean() > 2 * surface.shown[ceiling].mean()
 
 
 def test_the_points_are_the_same_every_time():
@@ -226,7 +244,7 @@ def test_points_that_were_not_seen_do_not_enter_the_map():
     surface = scene_surface(SIMULATOR, SETTINGS)
     seen = surface.points[:, 0] < 2.0
     quality = np.where(seen, 0.5, 0.0).astype(np.float32)[None]
-    part = SceneSurface(surface.points[seen], surface.normals[seen], surface.best[seen])
+    part = replace(surface, **{name: values[seen] for name, values in vars(surface).items()})
     here = (np.array([0]), np.array([[1.5, 0.0, 1.5]]), np.array([0.3]))
     drawn = SurfaceMapper(surface, 1.5).observe(quality, *here)
     assert drawn.sum() > 0

@@ -53,17 +53,17 @@ def new_cells(visible, slots, pose, centres, camera, max_range, rows, steps, fir
 
 
 @njit(cache=True)
-def new_surface(visible, slots, pose, points, normals, camera, max_range, rows, best, pairing, number):
+def new_surface(visible, slots, pose, points, normals, shown, camera, max_range, rows, best, pairing, number):
     """Raise the qualities of the surface points that agents' views show better than before, or from elsewhere.
 
-    Args as of `new_cells`, but for the points' `(m, 3)` unit `normals`, and those of `raise_point`: the arrays `best`
-    and `pairing`, written for points that all four places see, and `(k,)` the `number` of each agent's eye.
+    Args as of `new_cells`, but for the points' `(m, 3)` unit `normals`, and those of `raise_point`: `shown`, the arrays
+    `best` and `pairing`, written for points that all four places see, and `(k,)` the `number` of each agent's eye.
 
     Returns:
-        `(k, 2)` by how much Q and S grew in sum, `(p, 2)` pairs (index of the agent, point) on which the places differ,
-        and `(p,)` the quality of those pairs' views.
+        `(k, 4)` by how much Q, S, a·Q and a·S grew in sum, `(p, 2)` pairs (index of the agent, point) on which the
+        places differ, and `(p,)` the quality of those pairs' views.
     """
-    grown, count = np.zeros((len(slots), 2)), 0
+    grown, count = np.zeros((len(slots), 4)), 0
     pairs, values = np.empty((len(points), 2), np.int64), np.empty(len(points), np.float32)
     for k in range(len(slots)):
         if count + len(points) > len(pairs):
@@ -80,7 +80,7 @@ def new_surface(visible, slots, pose, points, normals, camera, max_range, rows, 
                     value = np.float32(quality(eye, points[point], normals[point]))
                     if may_grow(row, point, value, number[k], best, pairing):
                         if every & ONE:
-                            raise_point(row, point, value, number[k], points, normals, best, pairing, grown[k])
+                            raise_point(row, point, value, number[k], points, normals, shown, best, pairing, grown[k])
                         else:
                             pairs[count, 0], pairs[count, 1], values[count] = k, point, value
                             count += 1
@@ -89,11 +89,11 @@ def new_surface(visible, slots, pose, points, normals, camera, max_range, rows, 
 
 
 @njit(cache=True)
-def raise_points(rows, pairs, values, number, points, normals, best, pairing, grown):
+def raise_points(rows, pairs, values, number, points, normals, shown, best, pairing, grown):
     """`raise_point` for `(p, 2)` pairs (index of the agent, point) with qualities `values` `(p,)`."""
     for i in range(len(pairs)):
         k = pairs[i, 0]
-        raise_point(rows[k], pairs[i, 1], values[i], number[k], points, normals, best, pairing, grown[k])
+        raise_point(rows[k], pairs[i, 1], values[i], number[k], points, normals, shown, best, pairing, grown[k])
 
 
 @njit(cache=True)
@@ -112,7 +112,7 @@ def may_grow(row, point, value, number, best, pairing):
 
 
 @njit(cache=True)
-def raise_point(row, point, value, number, points, normals, best, pairing, grown):
+def raise_point(row, point, value, number, points, normals, shown, best, pairing, grown):
     """Enter that an agent's eye sees a point.
 
     Args:
@@ -122,13 +122,16 @@ def raise_point(row, point, value, number, points, normals, best, pairing, grown
         number: of the eye, which stands in `eyes`.
         points: `(m, 3)` metres.
         normals: `(m, 3)` unit vectors.
+        shown: `(m,)` a, how much of the pictures each point fills.
         best: `(n, m)` Q, greatest quality so far.
         pairing: `(n, m)` S, the greatest parallax quality so far; `(n, m, words)` bit sets of the eyes that saw the
             point and could matter; `(n, most, 3)` eyes, metres. Without words, S is not computed.
-        grown: `(2,)` to which the growth of Q and S is added.
+        grown: `(4,)` to which the growths of Q, S, a·Q and a·S are added.
     """
     if value > best[row, point]:
-        grown[0] += value - best[row, point]
+        more = value - best[row, point]
+        grown[0] += more
+        grown[2] += shown[point] * more
         best[row, point] = value
     pair, seen_from, eyes = pairing
     if seen_from.shape[2] == 0:
@@ -147,4 +150,5 @@ def raise_point(row, point, value, number, points, normals, best, pairing, grown
     after = np.float32(np.sqrt(square))
     if after > before:
         grown[1] += after - before
+        grown[3] += shown[point] * (after - before)
         pair[row, point] = after

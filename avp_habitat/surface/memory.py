@@ -57,7 +57,9 @@ class RoomSurface:
         self._eye = np.full(len(rows), -1)
         self._pair = np.zeros(shape if settings.with_parallax else (len(rows), 0), dtype=np.float32)
         self._seen_from = np.zeros((*shape, words if settings.with_parallax else 0), dtype=np.uint64)
-        self._reached = np.zeros((len(rows), 2))
+        self._reached = np.zeros((len(rows), 4))
+        best = self._surface.best, self._surface.best * self._surface.shown
+        self._most = np.repeat([each.sum() for each in best], 2)
         # Places that differ on every point, for who has no tables.
         self._unsure = np.array([0, 1, 1, 1], np.int32), pack(np.arange(2)[:, None] == np.ones(shape[1]))
 
@@ -68,14 +70,18 @@ class RoomSurface:
         self._eye[self._row[rows]] = -1
 
     def capture(self, views: Views, rows: Rows) -> NDArray[np.float64]:
-        """`(k, 2)` ΔQ and ΔS in sum of the newest views of k agents, which are remembered."""
+        """Remember the newest views of k agents.
+
+        Returns:
+            `(k, 2, 4)` by how much Q, S, a·Q and a·S grew in sum, and their `shares` then.
+        """
         rows, eyes = self._row[rows], np.ascontiguousarray(views.camera_to_world[:, :3, 3])
         moved = (self._eye[rows] < 0) | (self._eyes[rows, self._eye[rows]] != eyes).any(axis=1)
         self._eye[rows] += moved
         self._eyes[rows, self._eye[rows]] = eyes
         gain = self._capture(views, rows)
         self._reached[rows] += gain
-        return gain
+        return np.stack([gain, np.minimum(self._reached[rows] / self._most, 1.0)], axis=1)
 
     def observe(self, rows: Rows, position: Float, yaw: Float) -> NDArray[np.float32]:
         """`(k, surface.map.SIZE)` what k agents know of the surface; see `SurfaceMapper.observe`."""
@@ -92,8 +98,8 @@ class RoomSurface:
         return self._quality[self._row[row]]
 
     def shares(self, rows: Rows) -> NDArray[np.float64]:
-        """`(k, 2)` ΣQ and ΣS by the sum of the best qualities in the scene, which no agent knows, at most 1."""
-        return np.minimum(self._reached[self._row[rows]] / self._surface.best.sum(), 1.0)
+        """`(k, 4)` ΣQ, ΣS, Σa·Q and Σa·S by such sums of the best qualities, which no agent knows, at most 1."""
+        return np.minimum(self._reached[self._row[rows]] / self._most, 1.0)
 
     @property
     def _pairing(self) -> tuple[NDArray, NDArray, NDArray]:
@@ -104,7 +110,7 @@ class RoomSurface:
 
         Of what tables tell, only points on which their places differ are cast as rays.
         """
-        points, normals, pose = self._surface.points, self._surface.normals, views.camera_to_world
+        surface, pose = (self._surface.points, self._surface.normals, self._surface.shown), views.camera_to_world
         if self._rays is None:
             slots, visible = self._unsure
         else:
@@ -113,14 +119,14 @@ class RoomSurface:
         reach_m, camera, number = self._settings.max_range_m, self._camera, self._eye[rows]
         known = self._quality, self._pairing, number
         slots = np.broadcast_to(slots, (len(rows), 4))
-        gain, pairs, value = new_surface(visible, slots, pose, points, normals, camera, reach_m, rows, *known)
+        gain, pairs, value = new_surface(visible, slots, pose, *surface, camera, reach_m, rows, *known)
         if len(pairs):
             tolerance_m = self._settings.tolerance_m
             if self._rays is None:
                 reached = self._simulator.visible(
-                    pose, self._settings.intrinsics, points, pairs, tolerance_m=tolerance_m
+                    pose, self._settings.intrinsics, surface[0], pairs, tolerance_m=tolerance_m
                 )
             else:
-                reached = self._rays.reached(pose[:, :3, 3], points, pairs, tolerance_m=tolerance_m)
-            raise_points(rows, pairs[reached], value[reached], number, points, normals, *known[:2], gain)
+                reached = self._rays.reached(pose[:, :3, 3], surface[0], pairs, tolerance_m=tolerance_m)
+            raise_points(rows, pairs[reached], value[reached], number, *surface, *known[:2], gain)
         return gain

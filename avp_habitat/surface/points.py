@@ -25,6 +25,8 @@ _FLAT_SHARE = 0.002
 """A pixel has a normal where its four neighbours lie this close to its plane, as a share of its distance: the rounded
 normals of edges and corners would else count as surfaces that face a direction of their own."""
 _BEFORE_M = 0.01
+_LEVEL = 0.999
+"""Cosine of the pitch from which on a picture counts as level."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,8 @@ class SceneSurface:
     """`(m, 3)` unit vectors out of the surface, to the side from which it was seen."""
     best: NDArray[np.float64]
     """`(m,)` quality with which each was seen from the places where the points were looked for: about the best one."""
+    shown: NDArray[np.float64]
+    """`(m,)` a: how many pixels of level pictures from there showed each, in units of their mean."""
 
 
 def views_all_over(simulator: Simulator, settings: TaskSettings) -> Iterator[SampledView]:
@@ -75,23 +79,26 @@ def scene_surface(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
     Raises:
         UsageError: the scene shows no surface at all.
     """
-    found: list[NDArray[np.float64]] = [np.zeros((0, 7))]
+    found: list[NDArray[np.float64]] = [np.zeros((0, 8))]
     for view in views_all_over(simulator, settings):
-        found.append(_best(_flat_pixels(view.points, view.hit, view.camera_to_world[:3, 3].copy())))
+        pixels = _flat_pixels(view.points, view.hit, view.camera_to_world[:3, 3].copy())
+        pixels[:, 7] = view.camera_to_world[1, 1] > _LEVEL
+        found.append(_best(pixels))
     rows = _best(np.concatenate(found))
     if not len(rows):
         raise UsageError(f"reward or observation surface: {simulator.scene} shows none; expected walls or furniture")
-    points, normals, (best,) = (np.ascontiguousarray(part) for part in (rows[:, :3], rows[:, 3:6], rows[:, 6:].T))
-    return SceneSurface(points, normals, best)
+    points, normals = np.ascontiguousarray(rows[:, :3]), np.ascontiguousarray(rows[:, 3:6])
+    best, pixels = np.ascontiguousarray(rows[:, 6:].T)
+    return SceneSurface(points, normals, best, pixels / max(pixels.mean(), 1e-12))
 
 
 @njit(cache=True)
 def _flat_pixels(points, hit, eye):
-    """Where the surface is flat enough to have a normal: `(k, 7)` points, unit normals towards the eye, qualities.
+    """Where the surface is flat enough to have a normal: `(k, 8)` points, unit normals towards the eye, qualities, 0.
 
     `points` `(height, width, 3)` and `hit` `(height, width)` are those of a `SampledView`, the eye is `(3,)` metres.
     """
-    found, count = np.empty((hit.size, 7)), 0
+    found, count = np.zeros((hit.size, 8)), 0
     for i in range(1, hit.shape[0] - 1):
         for j in range(1, hit.shape[1] - 1):
             if not (hit[i, j] and hit[i, j + 1] and hit[i, j - 1] and hit[i + 1, j] and hit[i - 1, j]):
@@ -122,7 +129,10 @@ def _difference(a, b):
 
 
 def _best(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of `(n, 7)` points, normals and qualities the best one of each cube and direction, ordered by these."""
+    """Of `(n, 8)` points, normals, qualities and numbers of level pixels the best one of each cube and direction.
+
+    They are ordered by these; the pixels are all that show them.
+    """
     # Just before the surface: a wall that lies in the border of two layers of cubes would else be in both.
     cube = np.floor((rows[:, :3] + _BEFORE_M * rows[:, 3:6]) / EDGE_M).astype(np.int64)
     axis = np.abs(rows[:, 3:6]).argmax(axis=1)
@@ -131,4 +141,7 @@ def _best(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     keys = np.column_stack([cube, axis, side])[order]
     first = np.ones(len(rows), dtype=np.bool_)
     first[1:] = (keys[1:] != keys[:-1]).any(axis=1)
-    return rows[order[first]]
+    best = rows[order[first]]
+    if len(rows):
+        best[:, 7] = np.add.reduceat(rows[order, 7], np.flatnonzero(first))
+    return best

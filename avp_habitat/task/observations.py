@@ -66,7 +66,7 @@ class SceneAgents:
         return self._known().around(self.views, self._rows)
 
     def surface_shares(self) -> NDArray[np.float64]:
-        """`(k, 2)` ΣQ and ΣS by the sum of the best qualities in the scene, which no robot knows."""
+        """As `RoomSurface.shares`: what no robot knows."""
         return self._known().shares(self._rows)
 
     def free_floor(self, rays: int, most_m: float) -> NDArray[np.float32]:

@@ -93,14 +93,14 @@ class Onboard:
 class Privileged(Onboard):
     """`Onboard`, and what only the scene tells.
 
-    Coverage, the shares of ΣQ and ΣS, the offset from the start by the scene's diameter, and that in 20 m.
+    Coverage, the shares of Σa·Q and Σa·S, the offset from the start by the scene's diameter, and that in 20 m.
     """
 
     further = 6
 
     def _further(self, agents: Agents) -> list[NDArray[np.floating]]:
         offset = (agents.position - agents.start)[:, [0, 2]] / agents.diameter_m[:, None]
-        shares = agents.joined([scene.surface_shares() for scene in agents.scenes])
+        shares = agents.joined([scene.surface_shares()[:, 2:] for scene in agents.scenes])
         return [np.column_stack([agents.coverage, shares, offset, agents.diameter_m / 20.0])]
 
 

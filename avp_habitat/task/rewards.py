@@ -29,7 +29,7 @@ class RewardConstants:
     """α of `surface`: reward per (newly seen surface point)^β, each weighted by how well it is seen (`surfaces`)."""
     alpha_multiview: Amount = 0.02
     """α_m of `multiview`: reward per (growth of Q and S, by their weights)^β."""
-    single_weight: Annotated[float, Range(0, 1)] = 0.5
+    single_weight: Annotated[float, Range(0, 1)] = 0.3
     """w of `multiview`: weight of how well points are seen in one view (Q); 1 - w is that of two views (S)."""
     beta: Annotated[float, Range(0, 1)] = 0.9
     """β of `proposed`, `surface` and `multiview`, no unit, below 1: much that is new at once counts less than step
@@ -88,12 +88,16 @@ class StepFacts:
     """C after the step."""
     steps_left: Number
     """T − t after the step."""
-    new_parallax: Number | float = 0.0
-    """ΣΔS: by how much the points' parallax qualities grew by this step's view; 0 where not computed."""
+    new_shown: Number | float = 0.0
+    """Σa·ΔQ: as `new_surface`, each point by how much of the pictures it fills; 0 where not computed."""
+    new_shown_twice: Number | float = 0.0
+    """Σa·ΔS: so for how well points were seen along two rays; 0 where not computed."""
     surface: Number | float = 0.0
     """ΣQ after the step by the sum of the best qualities in the scene, within [0, 1]; 0 where not computed."""
-    parallax: Number | float = 0.0
-    """ΣS after the step by the same sum, within [0, 1]; 0 where not computed."""
+    shown: Number | float = 0.0
+    """Σa·Q after the step by the sum of a times the best qualities, within [0, 1]; 0 where not computed."""
+    shown_twice: Number | float = 0.0
+    """Σa·S after the step by the same sum, within [0, 1]; 0 where not computed."""
 
 
 RewardFunction = Callable[[StepFacts, RewardConstants], Mapping[str, Number | float]]
@@ -120,8 +124,8 @@ def reward(
     """Declare what a `RewardFunction` needs; one without this decorator needs nothing.
 
     Args:
-        needs_surface: `StepFacts.new_surface` and `surface` are computed, which takes time.
-        needs_parallax: `StepFacts.new_parallax` and `parallax` too, which takes more.
+        needs_surface: `StepFacts.new_surface`, `surface`, `new_shown` and `shown` are computed, which takes time.
+        needs_parallax: `StepFacts.new_shown_twice` and `shown_twice` too, which takes more.
         stops: whether there is the action stop; elsewhere it is "no movement". It ends the episode where this function
             of the step says so; True stands for `enough_coverage`.
     """
@@ -167,11 +171,14 @@ def surface(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
 
 @reward(needs_parallax=True, stops=always)
 def multiview(facts: StepFacts, constants: RewardConstants) -> dict[str, Number]:
-    """`surface` with w·ΣΔQ + (1 − w)·ΣΔS in place of ΣΔQ, and so the share that stop pays for."""
+    """`surface` with Σa·(w·ΔQ + (1 − w)·ΔS) in place of ΣΔQ, without the discount of visits.
+
+    What a view adds is new already, and a turn on the spot is how a second place pays.
+    """
     w = constants.single_weight
-    grown = w * facts.new_surface + (1 - w) * facts.new_parallax
-    new = _discounted(grown, constants.alpha_multiview, facts, constants)
-    stop = _stop(w * facts.surface + (1 - w) * facts.parallax, facts, constants)
+    grown = w * facts.new_shown + (1 - w) * facts.new_shown_twice
+    new = constants.alpha_multiview * np.power(grown, constants.beta)
+    stop = _stop(w * facts.shown + (1 - w) * facts.shown_twice, facts, constants)
     return {"multiview": new} | _costs(facts, constants) | {"stop": stop}
 
 

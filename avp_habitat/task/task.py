@@ -207,20 +207,18 @@ class ViewpointTask:
         steps = int(self.steps[row])
         position = self._path[row, 1 : steps + 1].copy()
         yaw, pitch = self._angles[row, 1 : steps + 1].T.copy()
-        names = ("action", "reward", "coverage", "collided", "redundant")
-        logged = {name: self._log[name][row, :steps].copy() for name in names}
         return Trajectory(
             start=self._path[row, 0].copy(),
             position=position,
             yaw=yaw,
             pitch=pitch,
             camera_to_world=motion.sensor_poses(self.settings, position, yaw, pitch),
-            action=logged["action"].astype(np.int64),
-            reward=logged["reward"],
+            action=self._log["action"][row, :steps].astype(np.int64),
+            reward=self._log["reward"][row, :steps].copy(),
             reward_parts={name: values[row, :steps].copy() for name, values in self._parts.items()},
-            coverage=logged["coverage"],
-            collided=logged["collided"].astype(np.bool_),
-            redundant=logged["redundant"].astype(np.bool_),
+            coverage=self._log["coverage"][row, :steps].copy(),
+            collided=self._log["collided"][row, :steps].astype(np.bool_),
+            redundant=self._log["redundant"][row, :steps].astype(np.bool_),
             first_seen=self.first_seen(row).copy(),
             surface=self.surface_share(row),
         )
@@ -287,28 +285,30 @@ class ViewpointTask:
         return room.sensor.capture(self._views(rows), self._first_seen, rows, self.steps[rows])
 
     def _capture_surface(self) -> NDArray[np.float64]:
-        """Enter ΣΔQ and ΣΔS of the newest views into the log, give the shares reached; zeros for nothing."""
-        shares = np.zeros((self.agents, 2))
+        """Enter ΔQ and ΔS of the newest views into the log, give `RoomSurface.capture`; zeros for nothing."""
+        surface = np.zeros((self.agents, 2, 4))
         for room, rows in self._by_room(self._everyone):
             if room.surface is not None:
-                self._gain[rows, self.steps[rows]] = room.surface.capture(self._views(rows), rows)
-                shares[rows] = room.surface.shares(rows)
-        return shares
+                surface[rows] = room.surface.capture(self._views(rows), rows)
+        self._gain[self._everyone, self.steps] = surface[:, 0, :2]
+        return surface
 
-    def _facts(self, actions: NDArray[np.integer], new_cells: NDArray[np.integer], shares: Float) -> StepFacts:
+    def _facts(self, actions: NDArray[np.integer], new_cells: NDArray[np.integer], surface: Float) -> StepFacts:
         past = motion.history(self._path, self._angles, self._cell, self.steps, self.settings.constants)
-        gain = self._gain[self._everyone, self.steps]
+        gain, share = surface[:, 0].T, surface[:, 1].T
         return StepFacts(
             new_cells=new_cells,
-            new_surface=gain[:, 0],
+            new_surface=gain[0],
             **past._asdict(),
             collided=self._collided,
             stop_chosen=(actions == STOP) & has_stop(self._reward),
             coverage=self.coverage,
             steps_left=self.settings.budget - self.steps,
-            new_parallax=gain[:, 1],
-            surface=shares[:, 0],
-            parallax=shares[:, 1],
+            new_shown=gain[2],
+            new_shown_twice=gain[3],
+            surface=share[0],
+            shown=share[2],
+            shown_twice=share[3],
         )
 
     def _observe(self, rows: Rows, seen: Shown, spread_m: NDArray[np.number]) -> Observed:
