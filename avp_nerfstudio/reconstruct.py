@@ -34,6 +34,9 @@ class Reconstruct:
     """The folder to write; must not exist."""
     method: Literal["avp-nerfacto", "nerfacto"] = "avp-nerfacto"
     """Of nerfstudio."""
+    depth: bool = True
+    """avp-nerfacto learns from the rollout's depth where it has some; --no-depth: from the colours alone, as nerfacto
+    does."""
     frames: int | None = None
     """Train on the first so many captured frames (omitted: all)."""
     iterations: int | None = None

@@ -83,7 +83,7 @@ def test_pictures_and_visibility_are_those_of_the_rollout(room, tmp_path):
     assert found["per_view"][1]["psnr"] == pytest.approx(-10 * np.log10(error), abs=0.05)
 
 
-def test_the_seed_decides_and_frames_matter(room, tmp_path):
+def test_the_seed_decides_and_frames_and_depth_matter(room, tmp_path):
     def psnr(name, **options):
         return reconstruct.reconstruct(Reconstruct(room, tmp_path / name, iterations=3, **options))["scores"]["psnr"]
 
@@ -91,6 +91,7 @@ def test_the_seed_decides_and_frames_matter(room, tmp_path):
     assert psnr("b", seed=1) == first
     assert psnr("c", seed=2) != first
     assert psnr("d", seed=1, frames=1) != first
+    assert psnr("e", seed=1, depth=False) != first
 
 
 @pytest.mark.filterwarnings("ignore")  # of nerfstudio's own command

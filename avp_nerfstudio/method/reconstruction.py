@@ -80,6 +80,7 @@ def process(
         "format_version": 1,
         "rollout": str(options.rollout),
         "method": options.method,
+        "depth": options.depth and options.method == "avp-nerfacto",
         "iterations": config.max_num_iterations,
         "frames": count,
         "seed": options.seed,
@@ -108,6 +109,8 @@ def _configuration(options: "Reconstruct", rollout: Rollout, outputs: Path) -> A
     """The `TrainerConfig` of a training that writes to a folder `outputs`."""
     config: Any = trainer_config() if options.method == "avp-nerfacto" else _nerfacto()
     manager = config.pipeline.datamanager
+    if options.method == "avp-nerfacto":
+        config.pipeline.model.use_depth = options.depth
     config.data = manager.data = manager.dataparser.data = rollout.folder.resolve()
     if options.frames is not None and options.frames < len(rollout.frames):
         manager.dataparser.max_views = options.frames
