@@ -66,7 +66,8 @@ ONBOARD = PPOPreset(
     learning_rate=5e-4,
     linear=True,
     ent_coef=0.02,
-    net_arch=(128, 64),
+    gamma=0.995,
+    net_arch=(256, 128),
     stop_logit=-5.0,
 )
 """For what a robot knows; of many scenes, in which many agents of a scene share the cost of a call."""

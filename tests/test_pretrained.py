@@ -180,6 +180,13 @@ def test_a_policy_for_other_observations_or_that_is_not_there_is_refused(folder,
         (folder / "homes.json").rename(near)
 
 
+def test_a_policy_in_another_body_acts_with_a_warning_that_says_what_differs(recwarn):
+    make_policy_env("pretrained", Corridor(), SETTINGS)
+    assert not recwarn
+    with pytest.warns(UserWarning, match=r"policy pretrained: made for other settings .*: turn_deg 10\.0, here 15\.0$"):
+        make_policy_env("pretrained", Corridor(), replace(SETTINGS, turn_deg=15.0))
+
+
 def test_a_file_chooses_no_module_to_import(tmp_path):
     out = exported(ppo(), tmp_path)
     changed(out / "m.json", observation={"kind": "evil:Kind", "shape": [12]})

@@ -1,6 +1,7 @@
 """The policies by name, and one episode of a policy in `AVP-v0`, step by step."""
 
 import inspect
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -54,6 +55,8 @@ POLICIES_HELP = (
 """Help of the option `--policy`."""
 TRUSTED = "open a model also where that may run code which its file holds: only if you know who made it"
 """Help of the option `--trusted`."""
+_FELT = ("forward_m", "turn_deg", "tilt_deg", "pitch_limit_deg", "sensor_height_m", "hfov_deg")
+"""Settings of body and camera: a policy acts in others than its own, but hardly well."""
 
 
 def check_policy(policy: Any) -> Any:
@@ -160,6 +163,12 @@ def _of_weights(policy: str, path: Path, env: AVPEnv, seed: int) -> Policy:
     actions = len(weights.actor[-1].bias)
     if (offered := getattr(env.action_space, "n", None)) != actions:
         raise MisfitError(f"{policy}: made for {actions} actions, but this environment has {offered}")
+    made, offered = weights.settings, env.settings.facts()
+    others = [f"{name} {made[name]}, here {offered[name]}" for name in _FELT if made.get(name) != offered[name]]
+    if made and others:
+        warnings.warn(
+            f"policy {policy}: made for other settings than this environment has: {', '.join(others)}", stacklevel=3
+        )
     return PretrainedPolicy(weights, seed)
 
 
