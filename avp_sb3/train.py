@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import psutil
 from tyro.conf import arg
 
 from avp_habitat import command
@@ -30,6 +31,8 @@ FIRST_SEED, _ROOMS_END = 1000, 100_000
 """Of the generated rooms and homes to train in; those from 100,000 on are for tests."""
 _GENTLER = 5
 """The learning rate is that much lower where a training starts from weights, which a few wild steps would spoil."""
+_PROCESS_GIB, _SCENE_GIB = 1.2, 0.05
+"""About what a process with everything imported takes, and what each open room or home of a pool adds to it."""
 _MLFLOW = "runs:/"
 _MOST = 1e12
 
@@ -140,6 +143,22 @@ class Train:
         return self.rooms + self.homes > 0
 
 
+def check_memory(options: Train) -> None:
+    """Refuse a pool that does not fit: the system would end the training without a word.
+
+    Raises:
+        UsageError: the machine has too little free memory for so many workers and open scenes.
+    """
+    processes = 1 + (options.workers or 0)
+    scenes = min(options.open_scenes, len(options.scenes))
+    needed, free = _PROCESS_GIB * processes + _SCENE_GIB * scenes, psutil.virtual_memory().available / 2**30
+    if options.pooled and needed > free:
+        raise UsageError(
+            f"open-scenes, workers: {scenes} scenes in {processes} processes need about {needed:.1f} GiB of memory, "
+            f"{free:.1f} GiB are free; expected fewer"
+        )
+
+
 def _environment(options: Train) -> Any:
     """The agents in this process, or in several: when asked for, and where each scene needs its own simulator."""
     from stable_baselines3.common.vec_env import VecMonitor
@@ -232,6 +251,7 @@ def _callbacks(options: Train, tracking: Any) -> list[Any]:
 def main(options: Train) -> None:
     """Train, track and save."""
     check_writable(options.out)
+    check_memory(options)
     print(f"opening {describe(options.scenes)} …", flush=True)
 
     # Late, so that --help and a mistyped option answer at once.

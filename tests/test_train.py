@@ -86,6 +86,10 @@ def test_the_training_script_trains_tracks_and_saves(tmp_path):
         (("--eval-every", 0), "--eval-every: expected a whole number from 1 to 1,000,000,000,000, got 0"),
         (("--gpu", 0), "--gpu: is of the simulator 'habitat', but 'raycast' was chosen"),
         (("--workers", 0), "workers: expected a multiple of the number of scenes, 1, got 0"),
+        (
+            ("--rooms", 2, "--workers", 99_999),
+            "open-scenes, workers: 2 scenes in 100000 processes need about 120000.1 GiB",
+        ),
     ],
 )
 def test_wrong_options_of_the_training_end_before_anything_is_made(refused, tmp_path, words, error):
