@@ -69,6 +69,8 @@ class PolicyCurves:
     """After how many views to measure."""
     simulator: SimulatorChoice = field(default_factory=SimulatorChoice)
     """Which simulator opens the scenes."""
+    together: bool = False
+    """Show one row for each policy over all scenes, not one for each scene; intervals are over all episodes."""
     width: Annotated[int, Range(40, 640)] = 160
     """Of the depth images that tell what was seen, pixels; their height is three quarters of it."""
     trusted: Annotated[bool, arg(help=TRUSTED)] = False
@@ -189,7 +191,21 @@ def is_done(cell: Cell, options: PolicyCurves, done: Sequence[dict[str, Any]]) -
 def shown(options: PolicyCurves, done: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """The entries that these settings made, which one table can hold."""
     wanted = options.made_by
-    return [entry for entry in done if {name: entry[name] for name in wanted} == wanted]
+    chosen = [entry for entry in done if {name: entry[name] for name in wanted} == wanted]
+    return together(chosen) if options.together else chosen
+
+
+def together(done: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """One entry for each policy, with the episodes of all its scenes; those without one in every scene are left out."""
+    scenes = {entry["scene"] for entry in done}
+    merged = []
+    for policy, actions in dict.fromkeys((entry["policy"], entry["actions"]) for entry in done):
+        cells = [entry for entry in done if (entry["policy"], entry["actions"]) == (policy, actions)]
+        if len(cells) == len(scenes):
+            episodes = [episode for entry in cells for episode in entry["episodes"]]
+            about = {"scene": f"{len(scenes)} scenes", "starts": len(episodes), "episodes": episodes}
+            merged.append({**cells[0], **summary(episodes), **about})
+    return merged
 
 
 def rows_of(done: Sequence[dict[str, Any]], views: Sequence[int]) -> str:

@@ -54,6 +54,19 @@ def test_cells_are_run_once_and_again_by_other_settings_only(script, options, ca
     assert capsys.readouterr().out.count("| builtin:3") == 1
 
 
+def test_one_row_holds_the_episodes_of_all_scenes(script, options, capsys):
+    both = replace(options, scene=("builtin:3", "builtin:4"), together=True)
+    script.main(both)
+    printed = capsys.readouterr().out
+    cells = json.loads(options.out.read_text())["cells"]
+    (entry,) = script.together(cells)
+    assert entry["starts"] == len(entry["episodes"]) == 4
+    mean = np.mean([cell["mean"]["visibility"] for cell in cells], axis=0)
+    assert entry["mean"]["visibility"] == pytest.approx(mean, abs=1e-4)
+    assert printed.count("| 2 scenes |") == 1
+    assert script.together(cells[:1])[0]["starts"] == 2
+
+
 def test_an_episode_that_stopped_keeps_its_last_value(script, options):
     simulator = open_simulator(SimulatorChoice(), "builtin:3")
     points = script.target_points(simulator, options.settings)
