@@ -251,9 +251,13 @@ def test_what_the_places_differ_on_is_returned_and_what_all_see_is_entered(room)
         np.testing.assert_array_equal(np.argwhere(seen == 3) if sure else pairs, inside)
         best = np.zeros((count, len(centres)), np.float32)
         pairing = np.zeros((count, 0), np.float32), np.zeros((count, 0, 0), np.uint64), np.zeros((count, 1, 3))
-        memory = rows, best, pairing, np.zeros(count, np.int64)
-        grown, _, values = new_surface(pack(members), slots, pose, centres, normals, shown, numbers, 4.0, *memory)
+        memory, asked = (rows, best, pairing, np.zeros(count, np.int64)), np.full((count, len(centres)), -1, np.int16)
+        grown, again, values = new_surface(
+            pack(members), slots, pose, centres, normals, shown, numbers, 4.0, *memory, asked
+        )
         np.testing.assert_allclose(best[tuple(inside.T)] if sure else values, quality, rtol=1e-6)
+        once_more = new_surface(pack(members), slots, pose, centres, normals, shown, numbers, 4.0, *memory, asked)
+        assert (len(again), len(once_more[1])) == ((0, 0) if sure else (len(inside), 0))
         assert grown[:, 0].sum() == pytest.approx(quality.sum() if sure else 0, rel=1e-4)
         assert grown[:, 2].sum() == pytest.approx(quality @ shown[inside[:, 1]] if sure else 0, rel=1e-4)
 

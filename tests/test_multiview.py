@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from corridor import Corridor
+from corridor import Corridor, RayCorridor
 from test_surface import SETTINGS as SURFACE
 from test_surface import WALK, seen_by_hand
 
@@ -36,7 +36,9 @@ def pairs_by_hand(points, qualities, eyes):
     return best
 
 
-def test_parallax_grows_by_the_best_pair_of_all_frames_so_far(corridor):
+@pytest.mark.parametrize("kind", [Corridor, RayCorridor])
+def test_parallax_grows_by_the_best_pair_of_all_frames_so_far(kind):
+    corridor = kind()
     task, surface = ViewpointTask(corridor, SETTINGS, agents=2), scene_surface(corridor, SETTINGS)
     shown, best_sum = surface.shown, (surface.shown * surface.best).sum()
     task.reset(range(2), corridor.area.centres[FEET], YAW)

@@ -53,11 +53,12 @@ def new_cells(visible, slots, pose, centres, camera, max_range, rows, steps, fir
 
 
 @njit(cache=True)
-def new_surface(visible, slots, pose, points, normals, shown, camera, max_range, rows, best, pairing, number):
+def new_surface(visible, slots, pose, points, normals, shown, camera, max_range, rows, best, pairing, number, asked):
     """Raise the qualities of the surface points that agents' views show better than before, or from elsewhere.
 
     Args as of `new_cells`, but for the points' `(m, 3)` unit `normals`, and those of `raise_point`: `shown`, the arrays
     `best` and `pairing`, written for points that all four places see, and `(k,)` the `number` of each agent's eye.
+    `asked` is `(n, m)` the number of the eye for which each point was returned last; it is not for the same eye again.
 
     Returns:
         `(k, 4)` by how much Q, S, a·Q and a·S grew in sum, `(p, 2)` pairs (index of the agent, point) on which the
@@ -78,12 +79,13 @@ def new_surface(visible, slots, pose, points, normals, shown, camera, max_range,
             while some != 0:
                 if some & ONE and in_view(pose[k], points[point], camera, max_range):
                     value = np.float32(quality(eye, points[point], normals[point]))
-                    if may_grow(row, point, value, number[k], best, pairing):
+                    if may_grow(row, point, value, number[k], best, pairing, asked):
                         if every & ONE:
                             raise_point(row, point, value, number[k], points, normals, shown, best, pairing, grown[k])
                         else:
                             pairs[count, 0], pairs[count, 1], values[count] = k, point, value
                             count += 1
+                            asked[row, point] = number[k]
                 some, every, point = some >> ONE, every >> ONE, point + 1
     return grown, pairs[:count], values[:count]
 
@@ -97,13 +99,15 @@ def raise_points(rows, pairs, values, number, points, normals, shown, best, pair
 
 
 @njit(cache=True)
-def may_grow(row, point, value, number, best, pairing):
+def may_grow(row, point, value, number, best, pairing, asked):
     """Whether a view of this quality could raise Q or S of a point, or help a later one to; see `raise_point`.
 
     The same eye sees a point equally well each time; no pair with a view is better than the root of its quality, for no
-    quality is above 1.
+    quality is above 1. Nor has it where this eye was `asked` for the point before.
     """
     pair, seen_from, _ = pairing
+    if asked[row, point] == number:
+        return False
     if seen_from.shape[2] == 0:
         return value > best[row, point]
     if (seen_from[row, point, number // 64] >> np.uint64(number % 64)) & ONE:

@@ -138,6 +138,18 @@ def pairs_in_image(
     return _pairs_in_image(_whole(camera_to_world), _whole(points), _whole(pairs, np.int64), camera_numbers(intrinsics))
 
 
+def rays_to_points(
+    eye: Float, points: Float, pairs: NDArray[np.integer], tolerance_m: float
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Rays to `(m, 3)` points from `(n, 3)` places, metres, for `(k, 2)` rows (place, point).
+
+    Returns:
+        `(k, 6)` origins and directions, which end `tolerance_m` before the point, so that one limit, t <= 1, fits all;
+        and `(k,)` whether a point lies within that of the place: its direction is 0.
+    """
+    return _rays_to_points(_whole(eye), _whole(points), _whole(pairs, np.int64), tolerance_m)
+
+
 def visible_in_depth(
     camera_to_world: Float,
     intrinsics: Intrinsics,
@@ -190,6 +202,20 @@ def _pairs_in_image(poses, points, pairs, camera):
     for k in range(len(pairs)):
         found[k] = in_image(*in_camera(poses[pairs[k, 0]], points[pairs[k, 1]]), camera)
     return found
+
+
+@njit(cache=True)
+def _rays_to_points(eye, points, pairs, tolerance):
+    rays, near = np.empty((len(pairs), 6), np.float32), np.zeros(len(pairs), np.bool_)
+    for k in range(len(pairs)):
+        start, end = eye[pairs[k, 0]], points[pairs[k, 1]]
+        x, y, z = end[0] - start[0], end[1] - start[1], end[2] - start[2]
+        distance = np.sqrt(x * x + y * y + z * z)
+        near[k] = distance <= tolerance
+        share = 0.0 if near[k] else 1.0 - tolerance / distance
+        rays[k, 0], rays[k, 1], rays[k, 2] = start[0], start[1], start[2]
+        rays[k, 3], rays[k, 4], rays[k, 5] = x * share, y * share, z * share
+    return rays, near
 
 
 @njit(cache=True)

@@ -134,16 +134,10 @@ class RaycastSimulator:
         self, eye: NDArray[np.floating], points: NDArray[np.floating], pairs: NDArray[np.integer], *, tolerance_m: float
     ) -> NDArray[np.bool_]:
         """Whether rays reach points in any direction; see `simulators.base.SingleRays.reached`."""
-        origin = np.asarray(eye, dtype=np.float64)[pairs[:, 0]]
-        offset = np.asarray(points, dtype=np.float64)[pairs[:, 1]] - origin
-        distance = np.sqrt((offset * offset).sum(axis=1))
-        far = distance > tolerance_m
-        # A ray's direction ends where its occlusion no longer counts, so that one limit, t <= 1, fits all rays.
-        share = 1.0 - tolerance_m / distance[far]
-        rays = np.concatenate([origin[far], offset[far] * share[:, None]], axis=1).astype(np.float32)
-        reached = np.ones(len(pairs), dtype=bool)
-        reached[far] = ~self._rays.blocked(rays)
-        return reached
+        from avp_habitat.sight.rules import rays_to_points
+
+        rays, near = rays_to_points(eye, points, pairs, tolerance_m)
+        return near | ~self._rays.blocked(rays)
 
     def distance(self, origin: NDArray[np.floating], direction: NDArray[np.floating]) -> NDArray[np.float32]:
         """Length of rays up to the first surface; see `simulators.base.SingleRays.distance`."""

@@ -58,6 +58,7 @@ class RoomSurface:
         self._pair = np.zeros(shape if settings.with_parallax else (len(rows), 0), dtype=np.float32)
         self._seen_from = np.zeros((*shape, words if settings.with_parallax else 0), dtype=np.uint64)
         self._reached = np.zeros((len(rows), 4))
+        self._asked = np.full(shape, -1, dtype=np.int16)
         best = self._surface.best, self._surface.best * self._surface.shown
         self._most = np.repeat([each.sum() for each in best], 2)
         # Places that differ on every point, for who has no tables.
@@ -67,7 +68,7 @@ class RoomSurface:
         """Forget what some agents saw."""
         for memory in (self._quality, self._pair, self._seen_from, self._reached):
             memory[self._row[rows]] = 0
-        self._eye[self._row[rows]] = -1
+        self._eye[self._row[rows]] = self._asked[self._row[rows]] = -1
 
     def capture(self, views: Views, rows: Rows) -> NDArray[np.float64]:
         """Remember the newest views of k agents.
@@ -79,6 +80,9 @@ class RoomSurface:
         moved = (self._eye[rows] < 0) | (self._eyes[rows, self._eye[rows]] != eyes).any(axis=1)
         self._eye[rows] += moved
         self._eyes[rows, self._eye[rows]] = eyes
+        if not isinstance(self._simulator, SingleRays):
+            # From one eye the same ray leads to a point each time, but not the same pixel of a depth image.
+            self._asked[rows] = -1
         gain = self._capture(views, rows)
         self._reached[rows] += gain
         return np.stack([gain, np.minimum(self._reached[rows] / self._most, 1.0)], axis=1)
@@ -119,7 +123,7 @@ class RoomSurface:
         reach_m, camera, number = self._settings.max_range_m, self._camera, self._eye[rows]
         known = self._quality, self._pairing, number
         slots = np.broadcast_to(slots, (len(rows), 4))
-        gain, pairs, value = new_surface(visible, slots, pose, *surface, camera, reach_m, rows, *known)
+        gain, pairs, value = new_surface(visible, slots, pose, *surface, camera, reach_m, rows, *known, self._asked)
         if len(pairs):
             tolerance_m = self._settings.tolerance_m
             if self._rays is None:
