@@ -16,7 +16,7 @@ class StopCallback(BaseCallback):
     what is left to the network is to tell when.
     """
 
-    def __init__(self, share: float = 0.95, rate: float = 0.03) -> None:
+    def __init__(self, share: float = 0.95, rate: float = 0.1) -> None:
         """Aim at this share of episodes that end by stop, raising the logit by `rate` in each update below it."""
         super().__init__()
         self._share, self._rate = share, rate
