@@ -35,8 +35,8 @@ class Reconstruct:
     method: Literal["avp-nerfacto", "nerfacto"] = "avp-nerfacto"
     """Of nerfstudio."""
     depth: bool = True
-    """avp-nerfacto learns from the rollout's depth where it has some; --no-depth: from the colours alone, as nerfacto
-    does."""
+    """avp-nerfacto learns from the rollout's depth where it has some; --no-depth: from the colours, as nerfacto does;
+    only the scene box still comes from depth."""
     frames: int | None = None
     """Train on the first so many captured frames (omitted: all)."""
     iterations: int | None = None

@@ -144,7 +144,7 @@ class Train:
 
 
 def check_memory(options: Train) -> None:
-    """Refuse a pool that does not fit: the system would end the training without a word.
+    """Refuse a pool that plainly does not fit: the system would end the training without a word.
 
     Raises:
         UsageError: the machine has too little free memory for so many workers and open scenes.

@@ -192,7 +192,8 @@ def shown(options: PolicyCurves, done: Sequence[dict[str, Any]]) -> list[dict[st
     """The entries that these settings made, which one table can hold."""
     wanted = options.made_by
     chosen = [entry for entry in done if {name: entry[name] for name in wanted} == wanted]
-    return together(chosen) if options.together else chosen
+    asked = {Path(scene).name for scene in options.scene}
+    return together([entry for entry in chosen if entry["scene"] in asked]) if options.together else chosen
 
 
 def together(done: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -33,7 +33,10 @@ from avp_habitat.tables import table
 from avp_nerfstudio.reconstruct import Reconstruct, reconstruct
 
 SHOWN = ("visibility", "visibility_parallax", "psnr", "ssim", "lpips")
-LEGEND = "Mean ± 95 % interval over the starts; depth: whether avp-nerfacto learned from depth images too."
+LEGEND = (
+    "Mean ± 95 % interval over the starts; depth: whether avp-nerfacto learned from depth images too (else only the "
+    "scene box is made from them)."
+)
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,11 @@ class PolicyReconstructions:
         hold_ranges(self)
         if not (self.scene and self.policy and self.depth):
             raise UsageError("scene, policy and depth: expected at least one of each")
+        for kind, names in (("scene", self.scene), ("policy", self.policy)):
+            if len({short(name) for name in names}) < len(names):
+                raise UsageError(
+                    f"{kind}: expected names that differ without folder and ending, got {', '.join(names)}"
+                )
 
 
 def short(name: str) -> str:
@@ -74,10 +82,10 @@ def short(name: str) -> str:
 
 def rollout_of(options: PolicyReconstructions, scene: str, policy: str, number: int) -> Path:
     """The rollout of one episode, collected if it is not there."""
-    out = options.folder / f"{short(scene)}-{short(policy)}-{number}"
+    seed, simulator, trusted = options.seed + number, options.simulator, options.trusted
+    out = options.folder / f"{short(scene)}-{short(policy)}-{seed}-{options.width}"
     if not out.exists():
         size = {"width": options.width, "height": options.width * 3 // 4}
-        seed, simulator, trusted = options.seed + number, options.simulator, options.trusted
         collect(Collect(scene, policy, out, seed=seed, simulator=simulator, trusted=trusted, mlflow="off", **size))
     return out
 

@@ -76,17 +76,17 @@ def test_tables_and_rays_agree_on_parallax(budget):
 
 
 def test_the_reward_weighs_both_growths_and_stop_ends_the_episode_at_any_time(corridor):
-    constants = replace(SETTINGS.constants, single_weight=0.2)
+    constants = replace(SETTINGS.constants, single_weight=0.35)
     task = ViewpointTask(corridor, replace(SETTINGS, constants=constants), agents=1)
     task.reset([0], corridor.area.centres[[100]], np.zeros(1))
     for action in (0, 1, 0):
         outcome = task.step(np.array([action]))
         facts = outcome.facts
-        amount = (0.2 * facts.new_shown + 0.8 * facts.new_shown_twice) ** 0.9
+        amount = (0.35 * facts.new_shown + 0.65 * facts.new_shown_twice) ** 0.9
         assert outcome.parts["multiview"] == pytest.approx(constants.alpha_multiview * amount)
         assert not outcome.terminated
     outcome = task.step(np.array([STOP]))
-    share = 0.2 * outcome.facts.shown + 0.8 * outcome.facts.shown_twice
+    share = 0.35 * outcome.facts.shown + 0.65 * outcome.facts.shown_twice
     assert outcome.terminated
     assert outcome.parts["stop"] == pytest.approx(constants.stop_surface_bonus * share)
     assert outcome.facts.coverage < 0.85

@@ -65,6 +65,8 @@ def test_one_row_holds_the_episodes_of_all_scenes(script, options, capsys):
     assert entry["mean"]["visibility"] == pytest.approx(mean, abs=1e-4)
     assert printed.count("| 2 scenes |") == 1
     assert script.together(cells[:1])[0]["starts"] == 2
+    script.main(replace(both, scene=("builtin:3",)))
+    assert capsys.readouterr().out.count("| 1 scenes |") == 1
 
 
 def test_an_episode_that_stopped_keeps_its_last_value(script, options):

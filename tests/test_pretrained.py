@@ -21,6 +21,7 @@ from avp_habitat import collect, command
 from avp_habitat.errors import PolicyError, UsageError
 from avp_habitat.policies import weights
 from avp_habitat.policies.registry import described, make_policy, make_policy_env
+from avp_habitat.policies.weights.format import write_weights
 from avp_habitat.policies.weights.policy import PretrainedPolicy
 from avp_habitat.rollout.format import read_rollout
 from avp_sb3 import AVPVecEnv, export, pretrained
@@ -105,6 +106,7 @@ def forbidden(*_, **__): raise AssertionError("pickle")
 pickle.load = pickle.loads = pickle.Unpickler = pickle._Unpickler = forbidden
 sys.modules["torch"] = sys.modules["stable_baselines3"] = None
 import numpy as np
+from avp_habitat.policies.weights.format import write_weights
 from avp_habitat.policies.weights.policy import PretrainedPolicy
 print(PretrainedPolicy.load({str(folder)!r}).predict(np.zeros((4, 12)), deterministic=True)[0].tolist())
 """
@@ -185,6 +187,12 @@ def test_a_policy_in_another_body_acts_with_a_warning_that_says_what_differs(rec
     assert not recwarn
     with pytest.warns(UserWarning, match=r"policy pretrained: made for other settings .*: turn_deg 10\.0, here 15\.0$"):
         make_policy_env("pretrained", Corridor(), replace(SETTINGS, turn_deg=15.0))
+
+
+def test_a_policy_of_unknown_settings_acts(tmp_path, recwarn):
+    write_weights(weights_of(ppo(SmallEnv()), "plain"), tmp_path)
+    assert make_policy(str(tmp_path), SmallEnv(), 0).weights.settings == {}
+    assert not [each for each in recwarn if "other settings" in str(each.message)]
 
 
 def test_a_file_chooses_no_module_to_import(tmp_path):

@@ -74,6 +74,16 @@ def test_points_weigh_as_their_patches_fill_level_pictures():
     assert surface.shown[wall].mean() > 2 * surface.shown[ceiling].mean()
 
 
+def test_where_no_level_picture_shows_anything_all_points_count_alike():
+    class Platform(Corridor):
+        def render(self, camera_to_world, intrinsics, *, rgb):
+            frames = super().render(camera_to_world, intrinsics, rgb=rgb)
+            level = np.abs(camera_to_world[:, 1, 1]) > 0.999
+            return replace(frames, depth=np.where(level[:, None, None], 0, frames.depth))
+
+    assert (scene_surface(Platform(), SETTINGS).shown == 1).all()
+
+
 def test_the_points_are_the_same_every_time():
     again = scene_surface(Corridor(), SETTINGS)
     np.testing.assert_array_equal(again.points, scene_surface(SIMULATOR, SETTINGS).points)

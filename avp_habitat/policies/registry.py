@@ -164,8 +164,10 @@ def _of_weights(policy: str, path: Path, env: AVPEnv, seed: int) -> Policy:
     if (offered := getattr(env.action_space, "n", None)) != actions:
         raise MisfitError(f"{policy}: made for {actions} actions, but this environment has {offered}")
     made, offered = weights.settings, env.settings.facts()
-    others = [f"{name} {made[name]}, here {offered[name]}" for name in _FELT if made.get(name) != offered[name]]
-    if made and others:
+    others = [
+        f"{name} {made[name]}, here {offered[name]}" for name in _FELT if name in made and made[name] != offered[name]
+    ]
+    if others:
         warnings.warn(
             f"policy {policy}: made for other settings than this environment has: {', '.join(others)}", stacklevel=3
         )

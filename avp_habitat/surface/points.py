@@ -89,7 +89,9 @@ def scene_surface(simulator: Simulator, settings: TaskSettings) -> SceneSurface:
         raise UsageError(f"reward or observation surface: {simulator.scene} shows none; expected walls or furniture")
     points, normals = np.ascontiguousarray(rows[:, :3]), np.ascontiguousarray(rows[:, 3:6])
     best, pixels = np.ascontiguousarray(rows[:, 6:].T)
-    return SceneSurface(points, normals, best, pixels / max(pixels.mean(), 1e-12))
+    # Where no level picture shows any, as from high above a floor, all count alike.
+    shown = pixels / pixels.mean() if pixels.any() else np.ones(len(pixels))
+    return SceneSurface(points, normals, best, shown)
 
 
 @njit(cache=True)
