@@ -30,15 +30,13 @@ class PPOPreset:
     """Discount per step."""
     net_arch: tuple[int, ...] = (64, 64)
     """Units of the layers of the policy's network, and of the value's; these are SB3's own."""
-    stop_logit: float = 0.0
-    """Of the action stop before the training: below 0, first episodes are long where stop ends them at any time."""
 
     def arguments(self) -> dict[str, Any]:
         """The keyword arguments of `stable_baselines3.PPO` but the number of agents."""
         from stable_baselines3.common.utils import LinearSchedule
 
         arguments = asdict(self)
-        del arguments["n_envs"], arguments["stop_logit"]
+        del arguments["n_envs"]
         arguments["policy_kwargs"] = {"net_arch": list(arguments.pop("net_arch"))}
         if arguments.pop("linear"):
             arguments["learning_rate"] = LinearSchedule(self.learning_rate, 0.0, 1.0)
@@ -47,7 +45,6 @@ class PPOPreset:
     def zoo(self) -> dict[str, Any]:
         """The same as rl_zoo3 writes it."""
         settings = asdict(self)
-        del settings["stop_logit"]
         settings["policy_kwargs"] = {"net_arch": list(settings.pop("net_arch"))}
         if settings.pop("linear"):
             settings["learning_rate"] = f"lin_{self.learning_rate:g}"
@@ -68,7 +65,6 @@ ONBOARD = PPOPreset(
     ent_coef=0.02,
     gamma=0.995,
     net_arch=(256, 128),
-    stop_logit=-5.0,
 )
 """For what a robot knows; of many scenes, in which many agents of a scene share the cost of a call."""
 PRESETS = {"numbers": TABLE_4, "map": MAP, "surface_map": MAP, "onboard": ONBOARD, "privileged": ONBOARD}

@@ -21,7 +21,7 @@ from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.simulators.registry import SimulatorChoice
 from avp_habitat.task.rewards import REWARDS_HELP, find_reward, stops_always
-from avp_habitat.task.settings import OBSERVATIONS_HELP, STOP, TaskSettings
+from avp_habitat.task.settings import OBSERVATIONS_HELP, TaskSettings
 from avp_habitat.tracking.experiments import DEFAULT_HELP
 from avp_sb3.exchange.sb3 import note_training, start_file, start_observation, started_ppo
 from avp_sb3.presets import MAP, PRESETS, PPOPreset
@@ -185,7 +185,6 @@ def _model(options: Train, env: Any) -> Any:
 
         policy = "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy"
         model = PPO(policy, env, device="cpu", **arguments)
-        model.policy.action_net.bias.data[STOP] = options.preset.stop_logit  # type: ignore[union-attr, index]
         return model
     with tempfile.TemporaryDirectory() as folder:
         path = _resumed_file(options.resume, folder)
@@ -234,15 +233,14 @@ def _resumed_file(resume: str, folder: str) -> Path:
 def _callbacks(options: Train, tracking: Any) -> list[Any]:
     from avp_sb3 import EvaluationCallback, MetricsCallback, RerunCallback, StopCallback
 
-    callbacks: list[Any] = []
+    # The stop is learned at the end, before MLflow keeps the model.
+    callbacks: list[Any] = [StopCallback()] if stops_always(find_reward(str(options.reward))) else []
     # First, so that scenes that cannot be opened leave no empty run behind.
     if options.eval_scene is not None:
         best = options.out.with_stem(f"{options.out.stem}-best")
         where: dict[str, Any] = vars(options.simulator) | {"navmesh": None}  # That is the training scene's.
         callbacks.append(EvaluationCallback(options.eval_scene, every=options.eval_every, best_model=best, **where))
     callbacks += [MetricsCallback(), tracking]
-    if stops_always(find_reward(str(options.reward))):
-        callbacks.append(StopCallback())
     if options.recording is not None:
         callbacks.append(RerunCallback(options.recording))
     return callbacks
@@ -277,6 +275,8 @@ def main(options: Train) -> None:
     finally:
         if model.num_timesteps > begun:
             save_model(model, options.out)
+            for fit in (getattr(callback, "fit", None) for callback in callbacks):
+                print("" if fit is None else f"stop: {fit}\n", end="")
             print(f"{options.out}: the policy after {model.num_timesteps} steps; MLflow run {tracking.run_id}")
             if model.num_timesteps < options.steps:
                 again = shlex.join(["python", "-m", "avp_sb3.train", *sys.argv[1:], "--resume", str(options.out)])

@@ -48,12 +48,12 @@ PARTS = {
 class Onboard:
     """What a robot knows, as one vector within [-1, 1].
 
-    state: t / T, (T - t) / 80, sine and cosine of pitch, least and mean depth of the newest view, collided, distance to
-    the mean position in 5 m. gains: of ΣΔQ and ΣΔS the newest view's and the mean of the last `RECENT`, by their roots,
-    and the logarithms of the sums so far. last action: one of six. free: in `RAYS` directions how far nothing
-    is known to block the way, in 3 m, and how much of that is observed floor. views from here: how many, by pitch and
-    yaw. views, floor and surface maps: 10 x 10 cells of 0.8 m, turned to the heading. surface around: see
-    `surface.around`.
+    state: t / T, exp(-(T - t) / 2) (when to stop at the latest), sine and cosine of pitch, least and mean depth of
+    the newest view, collided, distance to the mean position in 5 m. gains: of ΣΔQ and ΣΔS the newest view's and the
+    mean of the last `RECENT`, by their roots, and the logarithms of the sums so far. last action: one of six. free:
+    in `RAYS` directions how far nothing is known to block the way, in 3 m, and how much of that is observed floor.
+    views from here: how many, by pitch and yaw. views, floor and surface maps: 10 x 10 cells of 0.8 m, turned to the
+    heading. surface around: see `surface.around`.
     """
 
     needs_surface = True
@@ -106,7 +106,7 @@ class Privileged(Onboard):
 
 def _state(agents: Agents) -> NDArray[np.floating]:
     budget = agents.settings.budget
-    columns = [agents.steps / budget, (budget - agents.steps) / 80.0, np.sin(agents.pitch), np.cos(agents.pitch)]
+    columns = [agents.steps / budget, np.exp((agents.steps - budget) / 2.0), np.sin(agents.pitch), np.cos(agents.pitch)]
     columns += [agents.min_depth, agents.mean_depth, agents.collided * 1.0, agents.spread_m / _SPREAD_M]
     return np.column_stack(columns)
 

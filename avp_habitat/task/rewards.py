@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -260,6 +260,15 @@ def stops_episode(reward: RewardFunction, facts: StepFacts, constants: RewardCon
     if not has_stop(reward):
         return np.zeros(len(facts.coverage), dtype=np.bool_)
     return facts.stop_chosen & reward.stops(facts, constants)  # type: ignore[attr-defined]
+
+
+def stop_pays(reward: RewardFunction, facts: StepFacts, constants: RewardConstants) -> NDArray[np.float64]:
+    """`(n,)` what choosing stop adds to the reward of a step."""
+    totals = []
+    for chosen in (True, False):
+        parts = reward_parts(reward, replace(facts, stop_chosen=np.full(len(facts.coverage), chosen)), constants)
+        totals.append(np.sum(list(parts.values()), axis=0))
+    return totals[0] - totals[1]
 
 
 def reward_parts(

@@ -17,7 +17,7 @@ from avp_habitat.simulators.base import Frames, Simulator, SingleRays, pictures
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.task.env import step_info
 from avp_habitat.task.observations import Observed, action_space, each
-from avp_habitat.task.rewards import find_reward, stops_always
+from avp_habitat.task.rewards import find_reward, stop_pays, stops_always
 from avp_habitat.task.settings import TaskSettings
 from avp_habitat.task.task import ViewpointTask
 from avp_sb3.vec_env.pool import TURNOVER, ScenePool
@@ -82,7 +82,8 @@ class AVPVecEnv(VecEnv):
         self._left: dict[int, Simulator] = {}
         # Where an episode may be ended at any time, the end of the budget, which is observed, is an end like any other:
         # bootstrapping a value there would pay for not stopping.
-        self._stops_always = stops_always(find_reward(self.settings.reward))
+        self._reward = find_reward(self.settings.reward)
+        self._stops_always = stops_always(self._reward)
         self.render_mode = None
         self._task = ViewpointTask(opened, self.settings, agents)
         super().__init__(agents, self._task.kind.space, action_space())
@@ -133,6 +134,9 @@ class AVPVecEnv(VecEnv):
         outcome = self._task.step(self._actions)
         done = outcome.terminated | outcome.truncated
         infos = step_info(self._task, outcome)
+        if self._stops_always:
+            for info, pays in zip(infos, stop_pays(self._reward, outcome.facts, self.settings.constants), strict=True):
+                info["stop_pays"] = float(pays)
         observation = outcome.observation
         ended = np.flatnonzero(done)
         for row in ended:
