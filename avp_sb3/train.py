@@ -269,8 +269,12 @@ def main(options: Train) -> None:
     try:
         with tracking:
             # With reset_num_timesteps=False, SB3 counts the steps from where the model stands.
+            # Rich's bar, left open by Ctrl-C, can wait for its own thread for ever; a file has the metrics' lines.
             model.learn(
-                options.steps - begun, callback=callbacks, progress_bar=True, reset_num_timesteps=options.resume is None
+                options.steps - begun,
+                callback=callbacks,
+                progress_bar=sys.stdout.isatty(),
+                reset_num_timesteps=options.resume is None,
             )
     finally:
         if model.num_timesteps > begun:

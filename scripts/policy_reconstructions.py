@@ -82,11 +82,22 @@ def short(name: str) -> str:
 
 def rollout_of(options: PolicyReconstructions, scene: str, policy: str, number: int) -> Path:
     """The rollout of one episode, collected if it is not there."""
-    seed, simulator, trusted = options.seed + number, options.simulator, options.trusted
+    seed = options.seed + number
     out = options.folder / f"{short(scene)}-{short(policy)}-{seed}-{options.width}"
     if not out.exists():
-        size = {"width": options.width, "height": options.width * 3 // 4}
-        collect(Collect(scene, policy, out, seed=seed, simulator=simulator, trusted=trusted, mlflow="off", **size))
+        collect(
+            Collect(
+                scene,
+                policy,
+                out,
+                simulator=options.simulator,
+                seed=seed,
+                width=options.width,
+                height=options.width * 3 // 4,
+                trusted=options.trusted,
+                mlflow="off",
+            )
+        )
     return out
 
 
