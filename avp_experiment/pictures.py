@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 NOT_NAVIGABLE, NEVER = 0, 1
 """Numbers of a floor; one of 1 + t was first observed by view t."""
-DEFAULT_MAPS = ("heuristic", "coverage", "proposed")
+DEFAULT_MAPS = ("heuristic", "coverage", "proposed", "pretrained")
 """Methods of figure 5."""
-DEFAULT_RENDERS = ("heuristic", "survey", "coverage", "proposed", "surface")
+DEFAULT_RENDERS = ("heuristic", "proposed", "surface", "pretrained", "pretrained_tuned", "survey", "coverage")
 """Methods of figure 6, as far as they are there; else the first ones."""
 _COLUMNS = 5
 _ARROW_M = 0.22

@@ -257,7 +257,11 @@ def test_what_is_not_in_a_table_is_said_below_it(report, missing):
 FIGURES_LEFT_OUT = {
     "no reconstruction": (plots.psnr_by_views, without("reconstructions"), "no reconstruction has a PSNR"),
     "no training": (plots.reward_while_training, without("training"), "no training has a curve of rollout/ep_rew_mean"),
-    "no map": (maps, without_value("rollouts", map=None), "no episode of heuristic, coverage, proposed has a map"),
+    "no map": (
+        maps,
+        without_value("rollouts", map=None),
+        "no episode of heuristic, coverage, proposed, pretrained has a map",
+    ),
     "no visibility": (
         plots.visibility_and_psnr,
         without_value("reconstructions", visibility=None),
@@ -277,7 +281,7 @@ def test_a_map_that_is_missing_is_said(tmp_path):
     folder = incomplete(
         tmp_path, lambda results: [one.update(map=None) for one in results["rollouts"] if one["method"] == "coverage"]
     )
-    assert maps(read_results(folder)).caption.endswith("No map of coverage.")
+    assert maps(read_results(folder)).caption.endswith("No map of coverage, pretrained.")
 
 
 def test_an_experiment_without_results_is_a_page_that_says_so_and_no_figure_of_before_outlives_its_data(tmp_path):

@@ -58,7 +58,7 @@ class Form:
 # A dry run says what `make` would do; what it runs is tested by itself: examples/demo.py, setup.sh, and these tests.
 FORMS = {
     "python -m avp_habitat.collect --scene white_room.glb --policy pretrained --out runs/mine": Form(
-        r"opening builtin:0 for pretrained \(multiview, version 1\)(?s:.*)runs/mine: 8 views, coverage [\d.]+ %",
+        r"opening builtin:0 for pretrained \(multiview, version \d+\)(?s:.*)runs/mine: 8 views, coverage [\d.]+ %",
         {"white_room.glb": f"builtin:0 {PICTURES}"},
     ),
     "make demo": Form(r"examples/demo\.py", {"make": f"make --dry-run --directory {ROOT}"}),
