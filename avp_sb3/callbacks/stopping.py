@@ -113,7 +113,7 @@ def lost_by_stops(stops: NDArray[np.bool_], better: NDArray[np.floating]) -> flo
 
 def _ends(stops: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """`(e, n)` whether episodes are stopped, and the step in which they end, from 0."""
-    ended = stops.any(axis=1)
+    ended = np.asarray(stops.any(axis=1))
     return ended, np.where(ended, stops.argmax(axis=1), stops.shape[1] - 1)
 
 
