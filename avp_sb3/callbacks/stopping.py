@@ -1,5 +1,6 @@
 """Teach the action stop once the others are learned: from episodes that went on, the best time to stop is known."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,6 +59,7 @@ class StopCallback(BaseCallback):
             layer.weight[STOP], layer.bias[STOP] = 0.0, _NEVER
 
     def _on_step(self) -> bool:
+        _pays(self.locals["infos"][:1])  # now rather than after a whole training
         return True
 
     def _on_training_end(self) -> None:
@@ -85,10 +87,8 @@ def fit_stop(model: Any, env: VecEnv, *, episodes: int) -> StopFit:
         with torch.no_grad():
             others.append(_logits(model.policy, seen[-1])[:, _OTHERS])
         observation, _, _, infos = env.step(others[-1].argmax(dim=1).cpu().numpy())
-        if "stop_pays" not in infos[0]:
-            raise MissingInfoError("StopCallback: expected `stop_pays` in info, which AVPVecEnv gives")
         reward.append([sum(info["reward_parts"].values()) for info in infos])
-        pays.append([info["stop_pays"] for info in infos])
+        pays.append(_pays(infos))
     better = advantage_of_stop(*(np.reshape(each, (episodes, settings.budget, -1)) for each in (reward, pays)))
     chosen = np.broadcast_to(np.arange(better.shape[2]) % _HELD_OUT != _HELD_OUT - 1, better.shape).reshape(-1)
     told = torch.cat(seen), torch.cat(others), torch.from_numpy(better.reshape(-1)).to(others[0])
@@ -102,6 +102,15 @@ def fit_stop(model: Any, env: VecEnv, *, episodes: int) -> StopFit:
         model.policy.action_net.bias[STOP] += shift
     ended, step = _ends(margin > -shift)
     return StopFit(ended.size, float(ended.mean()), float((step + 1).mean()))
+
+
+def _pays(infos: Sequence[Mapping[str, Any]]) -> list[float]:
+    if "stop_pays" not in infos[0]:
+        raise MissingInfoError(
+            "StopCallback: expected `stop_pays` in info; train on AVPVecEnv or AVPSubprocVecEnv, for a reward whose "
+            "stop always ends the episode"
+        )
+    return [info["stop_pays"] for info in infos]
 
 
 def lost_by_stops(stops: NDArray[np.bool_], better: NDArray[np.floating]) -> float:
