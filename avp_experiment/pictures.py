@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 NOT_NAVIGABLE, NEVER = 0, 1
 """Numbers of a floor; one of 1 + t was first observed by view t."""
-DEFAULT_MAPS = ("heuristic", "coverage", "proposed", "pretrained")
+DEFAULT_MAPS = ("heuristic", "coverage", "proposed")
 """Methods of figure 5."""
 DEFAULT_RENDERS = ("heuristic", "proposed", "surface", "pretrained", "pretrained_tuned", "survey", "coverage")
 """Methods of figure 6, as far as they are there; else the first ones."""

@@ -260,7 +260,7 @@ FIGURES_LEFT_OUT = {
     "no map": (
         maps,
         without_value("rollouts", map=None),
-        "no episode of heuristic, coverage, proposed, pretrained has a map",
+        "no episode of heuristic, coverage, proposed has a map",
     ),
     "no visibility": (
         plots.visibility_and_psnr,
@@ -281,7 +281,7 @@ def test_a_map_that_is_missing_is_said(tmp_path):
     folder = incomplete(
         tmp_path, lambda results: [one.update(map=None) for one in results["rollouts"] if one["method"] == "coverage"]
     )
-    assert maps(read_results(folder)).caption.endswith("No map of coverage, pretrained.")
+    assert maps(read_results(folder)).caption.endswith("No map of coverage.")
 
 
 def test_an_experiment_without_results_is_a_page_that_says_so_and_no_figure_of_before_outlives_its_data(tmp_path):
