@@ -118,7 +118,7 @@ class _Planner:
         words += ["--seed", str(_START_SEEDS * (1 + start) + seed), "--budget", str(preset.budget)]
         words += ["--width", str(width), "--height", str(height), *self.configuration.simulator_options]
         words += ["--metrics", *self.configuration.metrics] if self.configuration.metrics else []
-        words += ["--out", self._out(COLLECT, name), "--mlflow", "off"]
+        words += ["--geometry", "--out", self._out(COLLECT, name), "--mlflow", "off"]
         return Cell(COLLECT, name, tuple(words), method, seed, scene, start, needs=training)
 
     def reconstruction(self, rollout: Cell, frames: int | None) -> Cell:

@@ -18,17 +18,19 @@ from avp_experiment.results import FILE, Key, Results, read_results
 from avp_experiment.statistics import NOTHING, Summary, summary
 from avp_habitat import command
 from avp_habitat.errors import AVPError, unknown_name
-from avp_habitat.metrics import FIGURES, Figure
+from avp_habitat.metrics import FIGURES, GEOMETRY, Figure
 from avp_habitat.tables import table
 
 PAGE, CLAIMS, READING = "results.md", "claims.md", "reading.md"
-_TABLES = {
-    "table2": (TRAIN, "Table 2: scenes of training"),
-    "table3": (UNSEEN, "Table 3: unseen scenes, no retraining"),
-}
 SCORES = ("psnr", "ssim", "lpips")
 COLUMNS = ("views", "coverage", "annd_m", "ei", "path_length_m", "visibility", "visibility_parallax", *SCORES)
-"""The suite's figures that the tables show; those that users added follow."""
+"""The suite's figures that tables 2 and 3 show; those that users added follow."""
+_TABLES = {
+    "table2": (TRAIN, "Table 2: scenes of training", COLUMNS),
+    "table2_geometry": (TRAIN, "Table 2, geometry: the captured depth, fused", GEOMETRY),
+    "table3": (UNSEEN, "Table 3: unseen scenes, no retraining", COLUMNS),
+    "table3_geometry": (UNSEEN, "Table 3, geometry: the captured depth, fused", GEOMETRY),
+}
 Rows = Mapping[str, Mapping[str, Summary | None]]
 _SETTINGS = ("seeds", "starts", "budget", "observation", "steps", "steps_rooms", "width", "height", "reconstruction",
              "iterations")  # fmt: skip
@@ -37,7 +39,9 @@ _SETTINGS = ("seeds", "starts", "budget", "observation", "steps", "steps_rooms",
 def write_report(folder: Path, *, shown_maps: Sequence[str] = DEFAULT_MAPS) -> Path:
     """Write tables, figures (5 of some methods), claims and the page that holds them; gives the page."""
     results = read_results(folder)
-    parts = [(title, partial(_table, role=role), name) for name, (role, title) in _TABLES.items()]
+    parts = [
+        (title, partial(_table, role=role, columns=columns), name) for name, (role, title, columns) in _TABLES.items()
+    ]
     parts += [(title, partial(_figure, draw=draw), name) for name, (title, draw) in _figures(shown_maps).items()]
     sections, left_out = [], []
     try:
@@ -70,17 +74,22 @@ def _figures(shown_maps: Sequence[str]) -> dict[str, tuple[str, Callable[[Result
     }
 
 
-def _table(results: Results, name: str, title: str, role: str) -> str:
+def _table(results: Results, name: str, title: str, role: str, columns: Sequence[str]) -> str:
     """Write the table of the scenes of a role, as Markdown and as CSV; what the page holds of it."""
     paths = [results.folder / f"{name}.{suffix}" for suffix in ("md", "csv")]
-    figures = {name: FIGURES[name] for name in COLUMNS} | dict(results.figures)
-    found = {method: {name: results.values(method, role, name) for name in figures} for method in results.methods}
+    figures = {name: FIGURES[name] for name in columns} | (dict(results.figures) if columns is COLUMNS else {})
+    found = {
+        method: {name: results.values(method, role, name) for name in {*figures, "coverage", "psnr"}}
+        for method in results.methods
+    }
     found = {method: values for method, values in found.items() if values["coverage"]}
     if not found:
         for path in paths:
             path.unlink(missing_ok=True)
         raise plots.Missing("no episode there is done" if results.scenes(role) else "no such scene in this experiment")
     shown = [figure for name, figure in figures.items() if any(values[name] for values in found.values())]
+    if not shown:
+        raise plots.Missing("no episode has such figures")
     rows = {method: {one.name: summary(values[one.name]) for one in shown} for method, values in found.items()}
     missing = [figure for figure in figures.values() if figure not in shown]
     notes = [f"No {figure.heading}: {_why_missing(results, figure.name)}." for figure in missing]

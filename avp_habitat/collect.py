@@ -27,9 +27,10 @@ from avp_habitat.policies.registry import (
 from avp_habitat.poses import Intrinsics
 from avp_habitat.provenance import nerfacto_line
 from avp_habitat.ranges import Range, hold_ranges
-from avp_habitat.rollout.capture import VIEWS, capture_heldout, capture_step, publish_rollout
+from avp_habitat.rollout.capture import capture_heldout, capture_step, publish_rollout
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.scenes.location import HELP as SCENES
+from avp_habitat.sight.heldout import VIEWS
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.task.budget import BUDGET_HELP, Budget, budget_for
 from avp_habitat.task.rewards import REWARDS_HELP
@@ -67,6 +68,8 @@ class Collect:
     """Of the pictures in pixels."""
     height: Annotated[int, Range(8, 8192)] = 480
     """Of the pictures in pixels."""
+    geometry: bool = False
+    """Also measure how true the fused depth is (accuracy, completion …); takes some seconds."""
     stochastic: bool = False
     """Sample a model's actions instead of taking the likeliest."""
     trusted: Annotated[bool, arg(help=TRUSTED)] = False
@@ -129,6 +132,7 @@ def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: 
             policy={"name": Path(name_of(options.policy)).name, "deterministic": not options.stochastic},
             seed=options.seed,
             heldout=heldout,
+            geometry=options.geometry,
             mlflow_run_id=getattr(policy, "avp_mlflow_run_id", None) or os.environ.get("MLFLOW_RUN_ID"),
         )
 

@@ -21,6 +21,8 @@ ALIKE_DISTANCE = 2.0
 """And when it stands no more than this many times as far away."""
 PARALLAX_DEG = 10.0
 """Rays this far apart show how far away a surface is, degrees."""
+NEAR_M = 0.05
+"""Surfaces that lie this near count as the same, metres."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,8 @@ _PARALLAX = f"that, along two rays at least {PARALLAX_DEG:g} degrees apart, whic
 _SEEN = "share of the held-out views' pixels whose surface a captured picture shows"
 _SHARE = "share of the navigable floor that some picture shows"
 _NEAREST = "mean distance from each camera to the nearest other one, small where places repeat"
+_NEAR = f"that lies within {100 * NEAR_M:g} cm of the shape"
+_NEAR_IT = f"that lies within {100 * NEAR_M:g} cm of the scene"
 _REPEATED = "like an earlier one in place and direction"
 _ALL = (
     Figure("coverage", "coverage", "%", 100, better="higher", meaning=_SHARE),
@@ -82,12 +86,21 @@ _ALL = (
     _visibility("_alike", "alike", _ALIKE),
     _visibility("_parallax", "parallax", _PARALLAX),
     _visibility("_weighted", "weighted", "that, weighted by how much the best ray is like the held-out one"),
+    Figure("completion_ratio", "completion ratio", "%", 100, 1, "higher", f"share of what can be seen {_NEAR}"),
+    Figure("completion_m", "completion", "cm", 100, 2, "lower", "mean distance from what can be seen to the shape"),
+    Figure("precision", "precision", "%", 100, 1, "higher", f"share of the shape {_NEAR_IT}"),
+    Figure("accuracy_m", "accuracy", "cm", 100, 2, "lower", "mean distance from the shape to the scene"),
+    Figure("f_score", "F-score", "%", 100, 1, "higher", "harmonic mean of precision and completion ratio"),
+    Figure("chamfer_m", "Chamfer-L1", "cm", 100, 2, "lower", "mean of accuracy and completion"),
+    Figure("depth_l1_m", "depth L1", "cm", 100, 1, "lower", "mean error of the shape's depth in the held-out views"),
     Figure("psnr", "PSNR", "dB", 1, 2, "higher", "likeness of rendered and true held-out views in dB"),
     Figure("ssim", "SSIM", "", 1, 3, "higher", "likeness of their structure, 1 is equal"),
     Figure("lpips", "LPIPS", "", 1, 3, "lower", "difference as a network sees it, 0 is equal"),
 )
 FIGURES = {figure.name: figure for figure in _ALL}
 """The suite's own figures by name, in the order in which tables show them."""
+GEOMETRY = ("completion_ratio", "completion_m", "precision", "accuracy_m", "f_score", "chamfer_m", "depth_l1_m")
+"""The figures of `geometry.scores`, in the tables' order."""
 TERMS = {figure.title: figure.meaning for figure in _ALL if figure.meaning} | {
     "held-out views": "pictures of the room that no reconstruction is trained on"
 }

@@ -21,10 +21,10 @@ from tqdm import tqdm
 
 from avp_habitat import command
 from avp_habitat.poses import Intrinsics
-from avp_habitat.rollout.capture import heldout_poses
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.scenes.loader import load_scene
 from avp_habitat.scenes.location import HELP as SCENES
+from avp_habitat.sight.heldout import heldout_poses
 from avp_habitat.simulators.raycast import RaycastSimulator
 from avp_habitat.task.settings import TaskSettings
 

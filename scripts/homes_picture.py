@@ -7,9 +7,9 @@ import numpy as np
 from PIL import Image
 
 from avp_habitat.poses import Intrinsics, camera_to_world
-from avp_habitat.rollout.capture import heldout_poses
 from avp_habitat.scenes.loader import Scene, load_scene
 from avp_habitat.scenes.mesh import TexturedMesh, only
+from avp_habitat.sight.heldout import heldout_poses
 from avp_habitat.simulators.raycast import RaycastSimulator
 
 TILE = (360, 270)

@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image
 
 from avp_habitat.poses import Intrinsics
-from avp_habitat.rollout.capture import heldout_poses
+from avp_habitat.sight.heldout import heldout_poses
 from avp_habitat.simulators.registry import make_simulator
 
 TILE = (480, 360)

@@ -29,8 +29,8 @@ from avp_habitat.policies.weights import PRETRAINED
 from avp_habitat.poses import Intrinsics
 from avp_habitat.provenance import PACKAGES, git_commit, installed_versions
 from avp_habitat.ranges import Range, hold_ranges
-from avp_habitat.rollout.capture import heldout_poses
 from avp_habitat.scenes.location import HELP as SCENES
+from avp_habitat.sight.heldout import heldout_poses
 from avp_habitat.sight.visibility import HeldoutPoints, grid_stride, heldout_points, visibility
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator

@@ -104,10 +104,22 @@ def _episode(rng, method, scene, seed, start):
             "path_length_m": float(5 + rng.normal(0, 0.3)),
             "collisions": 0,
             "visibility": 0.8 * coverage,
+            **_geometry(coverage),
         },
         "coverage_curve": [float(share) for share in curve],
         "visibility_curve": [float(0.8 * share) for share in curve],
         "map": _map(rng, views) if seed == start == 0 else None,
+    }
+
+
+def _geometry(coverage):
+    lengths = {"accuracy_m": 0.001, "completion_m": 1 - coverage, "chamfer_m": (1.001 - coverage) / 2}
+    return {
+        **lengths,
+        "depth_l1_m": 0.3,
+        "precision": 0.99,
+        "completion_ratio": 0.9 * coverage,
+        "f_score": 0.8 * coverage,
     }
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from nerfstudio_room import write_room
 
+from avp_habitat import command
 from avp_habitat.poses import Intrinsics
 from avp_habitat.scenes.loader import load_scene
 
@@ -55,6 +56,25 @@ def test_the_benchmark_of_the_environment_sets_steps_beside_their_rays(tmp_path)
         positive(row, "steps_per_s", "raw_rays_per_s", "raw_steps_per_s", "share")
         assert (row["rays_cast_per_step"] > 16 * 12) == (row["lookup"] == "off")
     positive(results["tables"][0], "cells", "area_m2", "build_s", "places", "memory_mb")
+
+
+def test_the_benchmark_of_geometry_changes_one_choice_at_a_time(tmp_path):
+    from avp_habitat import collect
+
+    words = ["--scene", "builtin:1", "--policy", "spin", "--budget", "4", "--width", "32", "--height", "24"]
+    assert command.run(collect.main, [*words, "--out", str(tmp_path / "r")]) == 0
+    (tmp_path / "b").mkdir()
+    rows = report(
+        run(
+            "geometry.py", "--rollout", tmp_path / "r", "--scene", "builtin:1", "--factors", 1.5, folder=tmp_path / "b"
+        ),
+        tmp_path / "b",
+    )["geometry"]
+    changed = [{name for name in list(row)[:4] if row[name] != rows[0][name]} for row in rows[1:]]
+    assert changed == [{"voxel_m"}, {"truncation_m"}, {"samples"}, {"places"}]
+    for row in rows:
+        positive(row, "completion_ratio", "precision", "truth_s", "fuse_s", "score_s")
+    assert rows[0]["moved"] == 0
 
 
 def test_the_benchmark_of_scenes_measures_rooms_and_halls(tmp_path):

@@ -10,7 +10,7 @@ import avp_habitat
 from avp_habitat.errors import SceneError, UsageError
 from avp_habitat.policies.reactive import HeuristicPolicy, RandomPolicy
 from avp_habitat.poses import Intrinsics, project, unproject
-from avp_habitat.rollout.capture import heldout_poses
+from avp_habitat.sight.heldout import heldout_poses
 from avp_habitat.sight.rules import candidates
 from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.task.env import AVPEnv

@@ -42,7 +42,8 @@ def without_column(page, title):
 
 
 def words_of(page):
-    """A page without what the new layout says in other words, and the column that tables have since."""
+    """A page without what the new layout says in other words, and the column and tables that there are since."""
+    page = re.sub(r"- Table \d, geometry: .*\n", "", page)
     page = (
         without_column(page, "parallax")
         .replace("path [m]", "path length [m]")

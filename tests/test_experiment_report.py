@@ -88,6 +88,20 @@ def test_the_tables_hold_means_and_intervals_over_seeds(whole, table, role):
         assert f" {mean:.2f} ± {half:.2f} " in line
 
 
+@pytest.mark.parametrize(("table", "role"), [("table2_geometry", "train"), ("table3_geometry", "unseen")])
+def test_geometry_has_tables_of_its_own(whole, table, role):
+    results, folder = whole
+    for method, row in rows_of(folder / f"{table}.csv").items():
+        ratio = by_seed(
+            results["rollouts"], lambda one: 100 * one["metrics"]["completion_ratio"], method=method, role=role
+        )
+        mean, half = interval(ratio)
+        assert float(row["completion ratio [%]"]) == pytest.approx(mean, rel=1e-5)
+        assert float(row["± completion ratio [%]"]) == pytest.approx(half, rel=1e-4)
+        assert float(row["accuracy [cm]"]) == pytest.approx(0.1)
+    assert f"| {results['methods'][0]} " in (folder / "results.md").read_text().partition("geometry: ")[2]
+
+
 def test_another_number_in_the_results_is_another_number_in_the_table(report):
     results = make_results(FEW, scenes=TRAIN_ONLY)
     before = (report(results) / "table2.md").read_text()

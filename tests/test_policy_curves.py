@@ -8,7 +8,7 @@ import pytest
 
 from avp_habitat.errors import UsageError
 from avp_habitat.poses import Intrinsics
-from avp_habitat.rollout.capture import heldout_poses
+from avp_habitat.sight.heldout import heldout_poses
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 
 SCRIPTS = Path(__file__).resolve().parent.parent / "scripts"

@@ -84,6 +84,10 @@ FORMS = {
         r"rollout +scene +policy +views +coverage +visibility.*\nruns/r0 +builtin:0 +heuristic +8 ",
         needs=(COLLECT,),
     ),
+    "python -m avp_habitat.geometry runs/r0 --scene builtin:0": Form(
+        r"shape +scene +policy +views +completion ratio \[%\](?s:.*)\nruns/r0 +builtin:0 +heuristic +8 ",
+        needs=(COLLECT,),
+    ),
     "Gymnasium": Form(r"^0\.159\d+$"),
     "Stable-Baselines3": Form(
         r"",

@@ -15,9 +15,10 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat import poses
-from avp_habitat.errors import AVPError, SceneError, UsageError
+from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.files import check_new
+from avp_habitat.geometry.scores import rollout_figures
+from avp_habitat.geometry.truth import scene_truth
 from avp_habitat.metrics import measured
 from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.plugins import name_of
@@ -28,52 +29,13 @@ from avp_habitat.rollout.format import Rollout
 from avp_habitat.rollout.images import write_numbers, write_rgb
 from avp_habitat.rollout.seen import visibility_of
 from avp_habitat.rollout.writing import RolloutWriter
-from avp_habitat.simulators.base import Simulator
+from avp_habitat.sight.heldout import VIEWS, heldout_poses, heldout_seed
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.settings import ACTION_NAMES
 from avp_habitat.task.trajectory import Trajectory
 
-VIEWS = 20
-"""Held-out views of a rollout."""
-PITCH_DEG = 20.0
-"""Their greatest pitch, either way."""
-MIN_MEAN_DEPTH_M = 1.0
-"""A view that sees no farther on average has its nose on a wall."""
-
-_TRIES = 2000
 _VERSIONED = ("avp-suite", "numpy", "gymnasium", "open3d", "pillow", "stable-baselines3", "torch")
 _FLOOR_FILE = "floor.png"
-
-
-def heldout_seed(scene_digest: str) -> int:
-    """The fixed seed of a scene's held-out views, from the digest of its content."""
-    return int(scene_digest[:16], 16)
-
-
-def heldout_poses(simulator: Simulator, *, sensor_height_m: float, views: int = VIEWS) -> NDArray[np.float64]:
-    """Poses uniform over the navigable area, any yaw, pitch within ±20°, that see at least 1 m far on average.
-
-    Returns:
-        `(views, 4, 4)` habitat camera_to_world; the same for the same scene, always.
-
-    Raises:
-        SceneError: the scene is too narrow for such views.
-    """
-    rng = np.random.default_rng(heldout_seed(simulator.scene_digest))
-    camera = Intrinsics.from_hfov(32, 24, hfov_deg=90.0)
-    found: list[NDArray[np.float64]] = []
-    for _ in range(_TRIES):
-        position = simulator.area.random_points(rng, 1) + np.array([0.0, sensor_height_m, 0.0])
-        yaw, pitch = rng.uniform(-np.pi, np.pi, 1), np.radians(rng.uniform(-PITCH_DEG, PITCH_DEG, 1))
-        pose = poses.camera_to_world(position, yaw=yaw, pitch=pitch)
-        if simulator.render(pose, camera, rgb=False).depth.mean() >= MIN_MEAN_DEPTH_M:
-            found.append(pose[0])
-        if len(found) == views:
-            return np.stack(found)
-    raise SceneError(
-        f"{simulator.scene}: found only {len(found)} of {views} held-out views that see at least "
-        f"{MIN_MEAN_DEPTH_M} m far on average; is the scene in metres?"
-    )
 
 
 def capture_step(env: AVPEnv, writer: RolloutWriter, action: int, reward: float, info: dict[str, Any]) -> None:
@@ -108,6 +70,7 @@ def publish_rollout(
     seed: int | None,
     heldout: int,
     mlflow_run_id: str | None = None,
+    geometry: bool = False,
 ) -> dict[str, Any]:
     """Draw the trajectory and the floor, measure what was seen, and publish the folder.
 
@@ -119,10 +82,14 @@ def publish_rollout(
         seed: of the episode's start; None when it was not seeded itself.
         heldout: number of held-out views written.
         mlflow_run_id: of the training that the policy comes from.
+        geometry: whether to measure how true the fused depth is, which takes some seconds.
 
     Returns:
-        The metrics of `rollout.json`: those of the episode, and where held-out views show a surface `visibility` and
-        `visibility_parallax`.
+        The metrics of `rollout.json`: those of the episode, where held-out views show a surface `visibility` and
+        `visibility_parallax`, and `metrics.GEOMETRY` where asked for and the pictures show any surface.
+
+    Raises:
+        SimulatorError: geometry is asked for, and the simulator gives no mesh.
     """
     write_rgb(writer.path("trajectory.png"), draw_trajectory(env.area, info["avp_trajectory"]))
     floor = _write_floor(env.area, info["avp_trajectory"], writer)
@@ -131,7 +98,8 @@ def publish_rollout(
     # From the files, in whole millimetres, so that the figure is the one that a reader of the folder computes.
     seen = visibility_of(frames, views, writer.intrinsics).figures() if views else {}
     visibility = {name: seen[name] for name in ("visibility", "visibility_parallax") if name in seen}
-    metrics = info["avp_episode"] | visibility | measured(env.settings.metrics, "rollout", rollout)
+    shape = rollout_figures(rollout, scene_truth(env.simulator, env.settings)) if geometry else {}
+    metrics = info["avp_episode"] | visibility | shape | measured(env.settings.metrics, "rollout", rollout)
     about = {"policy": policy, "seed": seed, "metrics": metrics, "floor": floor, "mlflow_run_id": mlflow_run_id}
     writer.publish(rollout.meta | about)
     return metrics

@@ -10,6 +10,7 @@ from avp_habitat.errors import SimulatorError
 from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.poses import Intrinsics
 from avp_habitat.scenes.location import Frame
+from avp_habitat.scenes.mesh import TexturedMesh
 
 
 @dataclass(frozen=True)
@@ -113,4 +114,17 @@ class SingleRays(Simulator, Protocol):
 
     def distance(self, origin: NDArray[np.floating], direction: NDArray[np.floating]) -> NDArray[np.float32]:
         """`(k,)` metres from `(k, 3)` origins along `(k, 3)` unit directions to the first surface, inf for none."""
+        ...
+
+
+@runtime_checkable
+class Meshed(Simulator, Protocol):
+    """A simulator that can say where all the surface of its scene is; ask for it by `isinstance`."""
+
+    def surface_mesh(self) -> TexturedMesh:
+        """The scene's triangles, world frame, without the holes of masked ones.
+
+        Raises:
+            SceneError: they cannot be read.
+        """
         ...

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avp_habitat.rollout.capture import heldout_poses
+from avp_habitat.sight.heldout import heldout_poses
 from avp_habitat.sight.rules import candidates
 from avp_habitat.simulators.registry import make_simulator
 from avp_habitat.task.env import AVPEnv

@@ -17,8 +17,9 @@ from avp_habitat.navigation.area import Float, NavigableArea
 from avp_habitat.navigation.navmesh import area_of_file, area_of_islands
 from avp_habitat.navigation.settings import NavigationSettings
 from avp_habitat.poses import Intrinsics, camera_to_world
-from avp_habitat.scenes.loader import identify
+from avp_habitat.scenes.loader import identify, load_located
 from avp_habitat.scenes.location import Frame, SceneLocation, locate
+from avp_habitat.scenes.mesh import TexturedMesh, without_holes
 from avp_habitat.sight.rules import visible_in_depth
 from avp_habitat.simulators.base import Frames
 from avp_habitat.simulators.habitat.engine import HabitatEngine, OverheadCamera
@@ -91,6 +92,7 @@ def _below_in_tile(engine: HabitatEngine, points: Float, corner: Float) -> NDArr
 _FOCAL_PX, _MOST_PX = 320.0, 1280
 """Points are looked for in images of about this focal length, that of 640x480 pixels at 90°, unless that is larger."""
 _CAMERAS_PER_CALL = 32
+_HOLE_M = 0.02
 
 
 class HabitatSimulator:
@@ -124,7 +126,7 @@ class HabitatSimulator:
         """
         require_installed()
         device = choose_gpu(gpu)
-        location = locate(scene, up=up)
+        self._location = location = locate(scene, up=up)
         self.scene = location.name
         self.scene_digest, self.scene_frame = identify(location)
         self._engine = _open(location, self.scene_frame, device)
@@ -155,6 +157,11 @@ class HabitatSimulator:
         if self.closed:
             raise SimulatorError(f"habitat: the simulator of {self.scene} was closed; open the scene again")
         return self._engine.render(camera_to_world, intrinsics, rgb=rgb)
+
+    def surface_mesh(self) -> TexturedMesh:
+        """All surfaces, as the suite reads them; see `simulators.base.Meshed.surface_mesh`."""
+        mesh = load_located(self._location, origin=self.scene_frame.origin).mesh
+        return without_holes(mesh, _HOLE_M)
 
     def visible(
         self,

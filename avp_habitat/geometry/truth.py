@@ -1,0 +1,90 @@
+"""What a reconstruction of a scene should hold: the part of its surface that the task's camera can see."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avp_habitat.errors import SimulatorError, UsageError
+from avp_habitat.geometry.shape import Shape
+from avp_habitat.poses import Intrinsics
+from avp_habitat.sight.heldout import heldout_poses
+from avp_habitat.sight.tables import once_per_simulator
+from avp_habitat.simulators.base import Meshed, Simulator
+from avp_habitat.task.settings import TaskSettings
+
+Float = NDArray[np.floating]
+
+SAMPLES = 100_000
+"""Points, uniform over the area of all the scene's surface, of which the observable ones are kept."""
+PLACES = 100
+"""Looked at from so many places all over the navigable area."""
+LEAST_SHARE = 0.02
+"""A point is observable where at least this share of the places see it. With one place as the limit, more places would
+always find more, through ever smaller gaps."""
+CAMERA = Intrinsics.from_hfov(160, 120, hfov_deg=90.0)
+"""Of the depth images of the held-out views."""
+_TOLERANCE_M = 0.005
+
+
+@dataclass(frozen=True)
+class SceneTruth:
+    """What is known of a scene, and compared with a reconstruction."""
+
+    name: str
+    """Of the scene."""
+    max_range_m: float
+    """As far as the camera sees."""
+    whole: Shape
+    """All its surface, also what nobody can see."""
+    observable: Float
+    """`(n, 3)` points, uniform over the area that can be seen, metres."""
+    heldout: NDArray[np.float64]
+    """`(views, 4, 4)` habitat poses of the held-out views."""
+    depth: NDArray[np.float32]
+    """`(views, height, width)` planar depth in metres that `CAMERA` has there, 0 where nothing is hit or far away."""
+
+
+@once_per_simulator("sensor_height_m", "max_range_m", "pitch_limit_deg", "hfov_deg", "width", "height")
+def scene_truth(
+    simulator: Simulator, settings: TaskSettings, *, samples: int = SAMPLES, places: int = PLACES
+) -> SceneTruth:
+    """The truth about an open scene; found once, in two seconds for a room.
+
+    Raises:
+        SimulatorError: the simulator gives no mesh.
+        SceneError: its mesh cannot be read, or no held-out view can be found.
+        UsageError: the camera sees no surface at all.
+    """
+    if not isinstance(simulator, Meshed):
+        raise SimulatorError(f"{simulator.scene}: the simulator {simulator.name} gives no mesh to compare with")
+    mesh = simulator.surface_mesh()
+    whole = Shape(mesh.vertices, mesh.triangles)
+    points = whole.samples(samples)
+    centres = simulator.area.centres
+    feet = centres[np.unique(np.linspace(0, len(centres) - 1, places).astype(int))]
+    seen = observable(points, whole, feet + [0.0, settings.sensor_height_m, 0.0], settings)
+    if not seen.any():
+        raise UsageError(f"{simulator.scene}: no surface can be seen from its navigable area")
+    poses = heldout_poses(simulator, sensor_height_m=settings.sensor_height_m)
+    depth = whole.depth(poses, CAMERA)
+    depth[depth > settings.max_range_m] = 0.0
+    return SceneTruth(simulator.scene, settings.max_range_m, whole, points[seen], poses, depth)
+
+
+def observable(points: Float, whole: Shape, eyes: Float, settings: TaskSettings) -> NDArray[np.bool_]:
+    """`(n,)` which of `(n, 3)` points of a shape a camera at `LEAST_SHARE` of `(k, 3)` eyes can see.
+
+    The camera can turn to any yaw, so that only elevation limits it: half the image's height beyond the greatest pitch.
+    """
+    camera = settings.intrinsics
+    half = np.arctan(camera.height / 2 / camera.fy)
+    steepest = min(np.radians(settings.pitch_limit_deg) + half, np.pi / 2)
+    count, needed = np.zeros(len(points), np.int64), max(1, round(LEAST_SHARE * len(eyes)))
+    for eye in eyes:
+        offset = points - eye
+        distance = np.linalg.norm(offset, axis=1)
+        within = (distance <= settings.max_range_m) & (np.abs(offset[:, 1]) <= np.sin(steepest) * distance)
+        asked = np.flatnonzero(within & (count < needed))
+        count[asked] += whole.reached(eye, points[asked], _TOLERANCE_M)
+    return count >= needed
