@@ -113,14 +113,9 @@ def _episode(rng, method, scene, seed, start):
 
 
 def _geometry(coverage):
-    known = {"accuracy_m": 0.001, "completion_m": 1 - coverage, "chamfer_m": (1.001 - coverage) / 2, "precision": 0.99}
-    return {**known, "depth_l1_m": 0.3, "completion_ratio": 0.9 * coverage, "f_score": 0.8 * coverage}
-        **lengths,
-        "depth_l1_m": 0.3,
-        "precision": 0.99,
-        "completion_ratio": 0.9 * coverage,
-        "f_score": 0.8 * coverage,
-    }
+    lengths = {"accuracy_m": 0.001, "completion_m": 1 - coverage, "chamfer_m": (1.001 - coverage) / 2}
+    shares = {"precision": 0.99, "completion_ratio": 0.9 * coverage, "f_score": 0.8 * coverage}
+    return {**lengths, **shares, "depth_l1_m": 0.3}
 
 
 def _reconstructions(rng, episode, prefixes, *, lpips):
