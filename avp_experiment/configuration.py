@@ -57,7 +57,7 @@ def known_methods() -> dict[str, Method]:
     return {method.name: method for method in methods}
 
 
-BASELINES = ("heuristic", "random", "frontier", "greedy", "oracle", "survey")
+BASELINES = ("heuristic", "random", "frontier", "greedy", "nbv", "oracle", "survey")
 """What learned policies are compared with by default; the last two plan with full knowledge."""
 DEFAULT = (*BASELINES, *REWARDS, f"proposed{ROOMS}", f"surface{ROOMS}", "pretrained")
 """The baselines, every reward, rewards trained over many rooms, and the weights of the package."""

@@ -51,6 +51,7 @@ _STYLES = {
     "survey": ("#5F5F5F", ">"),
     "frontier": ("#E69F00", "s"),
     "greedy": ("#CC79A7", "D"),
+    "nbv": ("#999933", "X"),
     "oracle": ("#009E73", "P"),
     "coverage": ("#56B4E9", "^"),
     "coverage_redundancy": ("#0072B2", "p"),

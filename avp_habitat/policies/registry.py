@@ -44,6 +44,7 @@ POLICIES = {
     "spin": "avp_habitat.policies.reactive:SpinPolicy.for_env",
     "frontier": "avp_habitat.policies.frontier:FrontierPolicy.for_env",
     "greedy": "avp_habitat.policies.greedy:GreedyPolicy.for_env",
+    "nbv": "avp_habitat.policies.nbv.planner:NextBestViewPolicy.for_env",
     "oracle": "avp_habitat.policies.oracle.policy:OraclePolicy.for_env",
     "survey": "avp_habitat.policies.oracle.policy:SurveyPolicy.for_env",
     "survey-multiview": "avp_habitat.policies.oracle.policy:MultiviewSurveyPolicy.for_env",

@@ -10,6 +10,7 @@ from avp_habitat.errors import SimulatorError
 from avp_habitat.navigation.area import NavigableArea
 from avp_habitat.scenes.location import Frame
 from avp_habitat.simulators.base import Simulator
+from avp_habitat.task.motion import sensor_poses
 from avp_habitat.task.settings import TaskSettings
 
 
@@ -64,6 +65,12 @@ class AgentView:
     """Planar depth in metres in the middle of the newest view, the whole range where nothing was hit."""
     collided: bool
     """Whether the newest step was a blocked forward move."""
+
+    @property
+    def camera_to_world(self) -> NDArray[np.float64]:
+        """`(4, 4)` pose of the newest view, habitat axes."""
+        angles = np.array([self.yaw]), np.array([self.pitch])
+        return sensor_poses(self.settings, self.position[None], *angles)[0]
 
     @property
     def area(self) -> NavigableArea:

@@ -25,6 +25,7 @@ _COLOURS = {
     "spin": "#8c564b",
     "frontier": "#17becf",
     "greedy": "#1f77b4",
+    "nbv": "#98df8a",
     "oracle": "#9467bd",
     "survey": "#e377c2",
     "survey-multiview": "#d6278f",
