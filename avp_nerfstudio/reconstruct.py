@@ -7,17 +7,20 @@ Importing nerfstudio takes seconds; a program with many reconstructions pays for
 import sys
 import time
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from avp_habitat import command
 from avp_habitat.errors import AVPError, RolloutError, UsageError
 from avp_habitat.files import atomic_folder
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.format import Rollout, read_rollout
+from avp_habitat.rollout.seen import expect_scene
+from avp_habitat.scenes.location import HELP as SCENES
+from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.tracking.stores import address_of, open_store
 
 
@@ -47,6 +50,11 @@ class Reconstruct:
     """Keep config.yml and checkpoint, for ns-eval, ns-render, ns-viewer and ns-export."""
     pictures: tuple[int, ...] = ()
     """Held-out views to keep as PNG, from 0."""
+    scene: Annotated[
+        str | None, arg(help=f"also measure the geometry of the reconstruction in this scene: {SCENES}")
+    ] = None
+    simulator: SimulatorChoice = field(default_factory=SimulatorChoice)
+    """Which simulator opens that scene."""
     mlflow: str = "off"
     """Log settings and scores as an MLflow run at an address such as sqlite:///mlflow.db; auto: MLFLOW_TRACKING_URI if
     that is set, else nowhere; off: nowhere."""
@@ -73,6 +81,9 @@ def reconstruct(options: Reconstruct) -> dict[str, Any]:
     with atomic_folder(options.out, failure=AVPError, option="--out") as folder:
         rollout = read_rollout(options.rollout)
         _check_rollout(options, rollout)
+        scene = None if options.scene is None else open_simulator(options.simulator, options.scene)
+        if scene is not None:
+            expect_scene(rollout, scene)
         address = address_of(options.mlflow, default=None)
         if address is not None:
             open_store(address)  # before anything is trained, which takes long
@@ -81,7 +92,7 @@ def reconstruct(options: Reconstruct) -> dict[str, Any]:
             warnings.simplefilter("ignore")
             from avp_nerfstudio.method.reconstruction import process
 
-            return process(options, rollout, folder, started=started, address=address)
+            return process(options, rollout, folder, scene, started=started, address=address)
 
 
 def _check_rollout(options: Reconstruct, rollout: Rollout) -> None:
@@ -102,7 +113,8 @@ def _check_rollout(options: Reconstruct, rollout: Rollout) -> None:
 def main(options: Reconstruct) -> None:
     """Reconstruct one rollout; print its scores."""
     found = reconstruct(options)
-    words = ", ".join(f"{name} {value:.4g}" for name, value in found["scores"].items() if value is not None)
+    values = {**found["scores"], **found["geometry"]}
+    words = ", ".join(f"{name} {value:.4g}" for name, value in values.items() if value is not None)
     missing = "" if found["lpips_reason"] is None else ", no lpips (scores.json says why)"
     print(f"{options.out}: {words}{missing}")
 

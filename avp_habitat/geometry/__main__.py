@@ -14,6 +14,7 @@ from avp_habitat.errors import RolloutError, SceneError, UsageError
 from avp_habitat.metrics import FIGURES, GEOMETRY, explained
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.format import name_of, read_rollout
+from avp_habitat.rollout.seen import expect_scene
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
@@ -63,8 +64,7 @@ def report_on(path: Path, simulator: Simulator, settings: TaskSettings) -> dict[
         return {"shape": str(path), "scene": simulator.scene, **_of_mesh(path, simulator, settings)}
     rollout = read_rollout(path)
     scene, policy = (name_of(rollout.meta, name) for name in ("scene", "policy"))
-    if rollout.meta.get("scene", {}).get("sha256") != simulator.scene_digest:
-        raise RolloutError(f"{path}: expected a rollout of {simulator.scene}, found one of {scene} of another digest")
+    expect_scene(rollout, simulator)
     figures = rollout_figures(rollout, scene_truth(simulator, settings))
     if not figures:
         raise RolloutError(f"{path}: expected depth pictures that show some surface, found none")

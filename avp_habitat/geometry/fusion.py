@@ -1,6 +1,7 @@
 """A mesh out of depth pictures, by a truncated signed distance function (Curless and Levoy, 1996), through Open3D."""
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ VOXEL_M = 0.0125
 """Side of a voxel, metres."""
 TRUNCATION_M = 0.04
 """Distances to the surface are known up to this, metres. More of it lets silhouettes leave more false surface."""
-_BLOCK, _BLOCKS = 8, 20_000
+_BLOCK, _BLOCKS, _STRIDE = 8, 20_000, 4
 
 
 def fuse(
@@ -42,18 +43,27 @@ def fuse(
     voxels = open3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight"), (core.float32, core.float32), (one, one), voxel_m, _BLOCK, _BLOCKS
     )
-    # Open3D cuts a pixel's coordinates to whole numbers, so that it counts from corners, as `Intrinsics` does.
-    camera = core.Tensor(
-        np.array([[intrinsics.fx, 0, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1]], np.float64)
-    )
+
+    def camera(by: int) -> Any:
+        """For images enlarged by a factor; Open3D cuts a pixel's coordinates, so it counts from corners as we do."""
+        fx, fy, cx, cy = (by * each for each in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
+        return core.Tensor(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64))
+
+    def image(depth: NDArray[np.float32]) -> Any:
+        return open3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(depth)))
+
+    multiplier = truncation_m / voxel_m
     for depth, pose in views:
-        image = open3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(depth, np.float32)))
-        extrinsic = core.Tensor(np.linalg.inv(habitat_to_opencv(np.asarray(pose, np.float64))))
-        if not ((depth > 0) & (depth <= far)).any():
+        planar = np.where((depth > 0) & (depth <= far), depth, 0.0).astype(np.float32)
+        if not planar.any():
             continue
-        multiplier = truncation_m / voxel_m
-        blocks = voxels.compute_unique_block_coordinates(image, camera, extrinsic, 1.0, far, multiplier)
-        voxels.integrate(blocks, image, camera, extrinsic, 1.0, far, multiplier)
+        extrinsic = core.Tensor(np.linalg.inv(habitat_to_opencv(np.asarray(pose, np.float64))))
+        # It looks for the blocks to fill at every fourth pixel only, between which there would be holes.
+        larger = planar.repeat(_STRIDE, axis=0).repeat(_STRIDE, axis=1)
+        blocks = voxels.compute_unique_block_coordinates(
+            image(larger), camera(_STRIDE), extrinsic, 1.0, far, multiplier
+        )
+        voxels.integrate(blocks, image(planar), camera(1), extrinsic, 1.0, far, multiplier)
     if not voxels.hashmap().size():
         return None
     # A surface that a single view shows is kept.

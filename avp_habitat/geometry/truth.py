@@ -7,10 +7,11 @@ from numpy.typing import NDArray
 
 from avp_habitat.errors import SimulatorError, UsageError
 from avp_habitat.geometry.shape import Shape
-from avp_habitat.poses import Intrinsics
+from avp_habitat.poses import Intrinsics, wrap_angle
 from avp_habitat.sight.heldout import heldout_poses
 from avp_habitat.sight.tables import once_per_simulator
 from avp_habitat.simulators.base import Meshed, Simulator
+from avp_habitat.task.motion import sensor_poses
 from avp_habitat.task.settings import TaskSettings
 
 Float = NDArray[np.floating]
@@ -24,6 +25,9 @@ LEAST_SHARE = 0.02
 always find more, through ever smaller gaps."""
 CAMERA = Intrinsics.from_hfov(160, 120, hfov_deg=90.0)
 """Of the depth images of the held-out views."""
+SCAN_VIEWS = 60
+"""Depth images of a model that are fused."""
+_GOLDEN_RAD = np.pi * (3 - 5**0.5)
 _TOLERANCE_M = 0.005
 
 
@@ -70,6 +74,18 @@ def scene_truth(
     depth = whole.depth(poses, CAMERA)
     depth[depth > settings.max_range_m] = 0.0
     return SceneTruth(simulator.scene, settings.max_range_m, whole, points[seen], poses, depth)
+
+
+def scan_poses(simulator: Simulator, settings: TaskSettings, views: int = SCAN_VIEWS) -> NDArray[np.float64]:
+    """`(views, 4, 4)` habitat poses all over the navigable area, the same ones always, to render a model's depth from.
+
+    Yaws turn by the golden angle from place to place; pitches are -30, 0 and 30 degrees in turn.
+    """
+    centres = simulator.area.centres
+    feet = centres[np.linspace(0, len(centres) - 1, views).astype(int)]
+    number = np.arange(views)
+    yaw = np.asarray(wrap_angle(number * _GOLDEN_RAD), np.float64)
+    return sensor_poses(settings, feet, yaw, np.radians(30.0) * (number % 3 - 1))
 
 
 def observable(points: Float, whole: Shape, eyes: Float, settings: TaskSettings) -> NDArray[np.bool_]:

@@ -36,11 +36,14 @@ from avp_habitat.provenance import git_commit, installed_versions
 from avp_habitat.rollout.format import Rollout
 from avp_habitat.rollout.images import write_rgb
 from avp_habitat.rollout.seen import visibility_of
+from avp_habitat.simulators.base import Simulator
+from avp_habitat.task.settings import TaskSettings
 from avp_habitat.tracking.stores import TrackingError
 from avp_nerfstudio.data.dataparser import AVPDataParserConfig
 from avp_nerfstudio.method.config import trainer_config
 from avp_nerfstudio.method.hash_encoding import compile_hash_encodings, compile_loops
 from avp_nerfstudio.method.scores import heldout_count, mean_scores, optional_lpips, render_views, to_8_bit
+from avp_nerfstudio.method.shape import model_figures
 from avp_nerfstudio.tracking import facts_of, open_again
 
 if TYPE_CHECKING:
@@ -52,9 +55,17 @@ _PACKAGES = ("avp-suite", "nerfstudio", "torch", "torchvision", "torchmetrics", 
 
 
 def process(
-    options: "Reconstruct", rollout: Rollout, folder: Path, *, started: float, address: str | None
+    options: "Reconstruct",
+    rollout: Rollout,
+    folder: Path,
+    scene: Simulator | None,
+    *,
+    started: float,
+    address: str | None,
 ) -> dict[str, Any]:
     """Train, score, and write everything of the folder, which becomes `options.out`; gives what `scores.json` holds.
+
+    The shape is measured in the scene, where one is given.
 
     Raises:
         RolloutError: nerfstudio cannot use the rollout.
@@ -72,6 +83,7 @@ def process(
             Trainer.train(trainer)
         trained = time.monotonic()
         views = _score(trainer.pipeline, folder, options.pictures)
+        shape = {} if scene is None else model_figures(trainer.pipeline, scene, _task_of(rollout))
     scored = time.monotonic()
     count = len(rollout.frames) if options.frames is None else options.frames
     seen = visibility_of(rollout.frames[:count], rollout.heldout, rollout.intrinsics)
@@ -85,6 +97,7 @@ def process(
         "frames": count,
         "seed": options.seed,
         "scores": mean_scores([scores for _, scores in views]),
+        "geometry": shape,
         "lpips_reason": getattr(trainer.pipeline.model.lpips, "reason", None),
         "per_view": [{"name": name, **scores} for name, scores in views],
         "visibility": {**seen.figures(), "per_view": seen.per_view().tolist()},
@@ -103,6 +116,14 @@ def process(
     if address is not None:
         _track(address, config, folder, found)
     return found
+
+
+def _task_of(rollout: Rollout) -> TaskSettings:
+    """What the figures of geometry need of the task."""
+    camera, coverage = (rollout.meta.get(name, {}) for name in ("camera", "coverage"))
+    height, reach = camera.get("height_above_floor_m"), coverage.get("max_range_m")
+    given = {"sensor_height_m": height, "max_range_m": reach}
+    return TaskSettings(**{name: value for name, value in given.items() if value is not None})
 
 
 def _configuration(options: "Reconstruct", rollout: Rollout, outputs: Path) -> Any:
@@ -189,7 +210,8 @@ def _track(address: str, config: Any, folder: Path, found: Mapping[str, Any]) ->
     """Log settings and scores; a store that fails is a warning, because the scores are there."""
     try:
         run, _ = open_again(address, facts_of(config), folder=folder)
-        values = {**found["scores"], **{k: v for k, v in found["visibility"].items() if k != "per_view"}}
+        seen = {name: share for name, share in found["visibility"].items() if name != "per_view"}
+        values = {**found["scores"], **found["geometry"], **seen}
         run.metrics({f"eval/{name}": v for name, v in values.items() if v is not None}, found["iterations"])
         run.close("FINISHED")
     except TrackingError as error:
