@@ -15,7 +15,7 @@ from avp_habitat import command
 from avp_habitat.errors import UsageError
 from avp_habitat.files import check_writable
 from avp_habitat.metrics import METRICS_HELP
-from avp_habitat.policies.registry import TRUSTED, learned_reward, load_model
+from avp_habitat.policies.registry import TRUSTED, check_policy, learned_reward, load_model
 from avp_habitat.policies.saved_model import is_normalised, load_statistics, statistics_of
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.scenes.location import HELP as SCENES
@@ -83,6 +83,10 @@ class Train:
     start: Annotated[str | None, arg(metavar="POLICY")] = None
     """Begin with the weights of a policy: pretrained, another name of `python -m avp_sb3.pretrained`, or the folder of
     one that `python -m avp_sb3.export` wrote; with a fifth of the learning rate."""
+    imitate: Annotated[str | None, arg(metavar="POLICY")] = None
+    """Imitate a policy first, survey-multiview for example, which plans with full knowledge of the scenes."""
+    demonstrations: Annotated[int, Range(8, _MOST)] = 42
+    """With --imitate: so many episodes of that policy."""
     trusted: Annotated[bool, arg(help=TRUSTED)] = False
     eval_scene: Annotated[tuple[str, ...] | None, arg(metavar="SCENE")] = None
     """Evaluate in these too, and keep the best model."""
@@ -99,6 +103,10 @@ class Train:
         hold_ranges(self)
         if self.start is not None and self.resume is not None:
             raise UsageError("start: expected one of --start and --resume, got both")
+        if self.imitate is not None:
+            if self.start is not None or self.resume is not None:
+                raise UsageError("imitate: expected no --start or --resume beside it: these have learned already")
+            check_policy(self.imitate)
         # Both are known from here on, so that nothing else asks where they came from.
         kind, reward = self.observation or "numbers", TaskSettings.reward
         if self.start is not None:
@@ -201,6 +209,21 @@ def _model(options: Train, env: Any) -> Any:
     return model
 
 
+def _imitated(options: Train, model: Any) -> Any:
+    from avp_sb3.imitation import demonstrate, imitate
+
+    shown = demonstrate(
+        str(options.imitate),
+        options.scenes,
+        options.settings,
+        episodes=options.demonstrations,
+        gamma=model.gamma,
+        seed=options.seed,
+        choice=options.simulator,
+    )
+    return imitate(model, shown)
+
+
 def _resumed_file(resume: str, folder: str) -> Path:
     """The model's file; MLflow's copy comes into the folder, with its statistics beside it."""
     if not resume.startswith(_MLFLOW):
@@ -262,6 +285,8 @@ def main(options: Train) -> None:
     torch.set_num_threads(1)
     env = _environment(options)
     model = _model(options, env)
+    if options.imitate is not None:
+        print(f"imitation: {_imitated(options, model)}", flush=True)
     note_training(model, options.settings, options.scenes)
     tracking = MLflowCallback(options.experiment, run_name=options.run_name)
     callbacks = _callbacks(options, tracking)
