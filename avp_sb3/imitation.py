@@ -75,7 +75,7 @@ def demonstrate(
     if episodes < _HELD_OUT:
         raise UsageError(f"demonstrations: expected at least {_HELD_OUT} episodes, got {episodes}")
     count = min(len(scenes), -(-episodes // EPISODES_OF_A_SCENE))
-    chosen = [scenes[round(index)] for index in np.linspace(0, len(scenes) - 1, count).tolist()]
+    chosen = [str(scenes[round(index)]) for index in np.linspace(0, len(scenes) - 1, count).tolist()]
     shown: list[Demonstrations] = []
     numbers = itertools.count()
     with progress(total=episodes, unit="episode", desc=f"watching {policy}") as bar:
