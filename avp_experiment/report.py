@@ -77,15 +77,16 @@ def _figures(shown_maps: Sequence[str]) -> dict[str, tuple[str, Callable[[Result
 def _table(results: Results, name: str, title: str, role: str, columns: Sequence[str]) -> str:
     """Write the table of the scenes of a role, as Markdown and as CSV; what the page holds of it."""
     paths = [results.folder / f"{name}.{suffix}" for suffix in ("md", "csv")]
+    # One of an earlier state of the results would stand beside figures of this one.
+    for path in paths:
+        path.unlink(missing_ok=True)
     figures = {name: FIGURES[name] for name in columns} | (dict(results.figures) if columns is COLUMNS else {})
     found = {
-        method: {name: results.values(method, role, name) for name in {*figures, "coverage", "psnr"}}
+        method: {name: results.values(method, role, name) for name in {*figures, "coverage"}}
         for method in results.methods
     }
     found = {method: values for method, values in found.items() if values["coverage"]}
     if not found:
-        for path in paths:
-            path.unlink(missing_ok=True)
         raise plots.Missing("no episode there is done" if results.scenes(role) else "no such scene in this experiment")
     shown = [figure for name, figure in figures.items() if any(values[name] for values in found.values())]
     if not shown:
@@ -130,7 +131,7 @@ def _notes(results: Results, role: str, found: Mapping[str, Mapping[str, Mapping
     fewer = [
         f"{method} {len(values['coverage'])} episodes, {len(values['psnr'])} reconstructions"
         for method, values in found.items()
-        if min(len(values["coverage"]), len(values["psnr"])) < most and values["psnr"]
+        if values.get("psnr") and min(len(values["coverage"]), len(values["psnr"])) < most
     ]
     if fewer:
         notes.append(f"Of fewer than {most} episodes or reconstructions: {'; '.join(fewer)}.")

@@ -31,6 +31,7 @@ from avp_habitat.rollout.capture import capture_heldout, capture_step, publish_r
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.sight.heldout import VIEWS
+from avp_habitat.simulators.base import Meshed
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.task.budget import BUDGET_HELP, Budget, budget_for
 from avp_habitat.task.rewards import REWARDS_HELP
@@ -109,6 +110,10 @@ def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: 
     with RolloutWriter(options.out, camera) as writer:
         simulator = open_simulator(options.simulator, options.scene)
         settings = settings or _settings(options, simulator.area.area_m2)
+        geometry = options.geometry and isinstance(simulator, Meshed)
+        if options.geometry and not geometry:
+            text = f"geometry is left out: the simulator {simulator.name} gives no mesh to compare with"
+            print(f"warning: {text}", file=sys.stderr)
         env, policy = make_policy_env(
             options.policy,
             simulator,
@@ -132,7 +137,7 @@ def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: 
             policy={"name": Path(name_of(options.policy)).name, "deterministic": not options.stochastic},
             seed=options.seed,
             heldout=heldout,
-            geometry=options.geometry,
+            geometry=geometry,
             mlflow_run_id=getattr(policy, "avp_mlflow_run_id", None) or os.environ.get("MLFLOW_RUN_ID"),
         )
 

@@ -18,7 +18,7 @@ from avp_habitat.errors import AVPError, RolloutError, UsageError
 from avp_habitat.files import atomic_folder
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.format import Rollout, read_rollout
-from avp_habitat.rollout.seen import expect_scene
+from avp_habitat.rollout.origin import expect_scene
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.tracking.stores import address_of, open_store

@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from corridor import Corridor
 from scipy.spatial import cKDTree
 
-from avp_habitat import command
+from avp_habitat import collect, command
 from avp_habitat.geometry import __main__ as geometry
 from avp_habitat.geometry.fusion import fuse
+from avp_habitat.geometry.placement import misplacement
 from avp_habitat.geometry.scores import score
 from avp_habitat.geometry.shape import Shape
 from avp_habitat.geometry.truth import CAMERA, SceneTruth, observable, scene_truth
@@ -146,7 +148,8 @@ def write_room(path, change):
         (lambda v: v * [-1, 1, 1], "it lies mirrored (the scene's X is its -X, Y is its Y, Z is its Z)"),
         (lambda v: v * 1000, "times as large as the scene"),
         (lambda v: (v[:, [0, 2, 1]] * [1, -1, 1] - [1, 2, 3]) * 0.25, "and 0.25 times as large"),
-        (lambda v: v + [0.7, 0, 0.4], "it lies elsewhere"),
+        (lambda v: v + [1.3, 0.5, 0.9], "it lies elsewhere"),
+        (lambda v: v * 0.001, "times as large as the scene"),
     ],
 )
 def test_a_mesh_in_another_frame_is_refused_with_the_frame_named(tmp_path, capsys, change, words):
@@ -168,10 +171,18 @@ def test_a_mesh_made_elsewhere_is_scored(tmp_path, capsys, ending):
     assert [report[name] for name in GEOMETRY] == pytest.approx([1, 0, 1, 0, 1, 0, 0], abs=1e-5)
 
 
+def test_a_shape_that_is_bad_but_in_place_is_scored():
+    simulator = open_simulator(SimulatorChoice(), "builtin:3")
+    truth, mesh = scene_truth(simulator, TaskSettings()), simulator.surface_mesh()
+    room = Shape(mesh.vertices, mesh.triangles)
+    middle = mesh.vertices.mean(axis=0)
+    shell = both(room, Shape((mesh.vertices - middle) * 4 + middle, mesh.triangles))
+    low, blob = Shape(mesh.vertices + [0, 0.12, 0], mesh.triangles), plate(0.3, 0.3, *middle)
+    assert [misplacement(each, truth) for each in (room, shell, low, blob)] == [None] * 4
+
+
 @pytest.fixture(scope="module")
 def rollout(tmp_path_factory):
-    from avp_habitat import collect
-
     folder = tmp_path_factory.mktemp("geometry") / "rollout"
     options = ["--scene", "builtin:3", "--policy", "heuristic", "--out", str(folder), "--budget", "12", "--geometry"]
     assert command.run(collect.main, [*options, "--width", "160", "--height", "120"]) == 0
@@ -201,3 +212,33 @@ def test_what_cannot_be_scored_is_one_line(rollout, capsys, shape, scene, words)
     shape = str(rollout) if shape == "ROLLOUT" else shape
     assert command.run(geometry.main, [shape, "--scene", scene]) == 1
     assert words in capsys.readouterr().err
+
+
+def test_what_the_task_was_is_read_from_the_rollout_itself(tmp_path, capsys):
+    settings = TaskSettings(sensor_height_m=0.5, max_range_m=2.5, budget=6, pitch_limit_deg=20.0)
+    folder = tmp_path / "low"
+    options = collect.Collect("builtin:3", "nbv", folder, width=64, height=48, geometry=True)
+    kept = collect.collect(options, settings=settings)
+    assert command.run(geometry.main, [str(folder), "--scene", "builtin:3", "--json"]) == 0
+    (report,) = json.loads(capsys.readouterr().out)
+    assert [report[name] for name in GEOMETRY] == [kept[name] for name in GEOMETRY]
+    shown = json.loads((folder / "rollout.json").read_text())
+    (folder / "rollout.json").write_text(json.dumps(shown | {"scene": "builtin:3"}))
+    assert command.run(geometry.main, [str(folder), "--scene", "builtin:3"]) == 1
+    assert "rollout.json: " in capsys.readouterr().err
+
+
+def test_a_bad_shape_among_good_ones_does_not_lose_them(rollout, capsys):
+    assert command.run(geometry.main, [str(rollout), "missing", "--scene", "builtin:3"]) == 1
+    said = capsys.readouterr()
+    assert "heuristic" in said.out
+    assert "missing: expected a rollout folder" in said.err
+
+
+def test_a_simulator_without_a_mesh_collects_without_geometry(tmp_path, capsys):
+    choice = SimulatorChoice(simulator=lambda scene: Corridor())
+    options = collect.Collect(
+        "a", "spin", tmp_path / "r", simulator=choice, budget=3, width=32, height=24, geometry=True
+    )
+    assert "accuracy_m" not in collect.collect(options)
+    assert "geometry is left out: the simulator corridor gives no mesh" in capsys.readouterr().err

@@ -141,6 +141,23 @@ def test_it_sees_more_of_a_room_than_planners_of_the_floor(scene):
     assert seen["nbv"] > seen["frontier"] + 0.15
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [{"pitch_limit_deg": 15.0}, {"pitch_limit_deg": 0.0}, {"turn_deg": 20.0, "tilt_deg": 20.0}, {"tilt_deg": 12.0},
+     {"turn_deg": 120.0}, {"tilt_deg": 60.0}, {"turn_deg": 7.0, "tilt_deg": 3.0}, {"width": 100, "height": 20}],
+    ids=str,
+)  # fmt: skip
+def test_it_never_turns_to_and_fro_whatever_turns_and_tilts_are(room, changes):
+    settings = replace(SETTINGS, budget=60, **changes)
+    for seed in (0, 1):
+        env, policy = make_policy_env("nbv", room, settings, seed=seed)
+        poses = np.array([env.camera_to_world for _ in steps_of(env, policy, seed=seed)]).round(4)
+        # A view that was taken is not gone for again, though it may lie on the way to others.
+        times = np.unique(poses.reshape(len(poses), -1), axis=0, return_counts=True)[1]
+        assert times.max() <= 6, (changes, seed)
+        assert len(times) >= 12, (changes, seed)
+
+
 def test_the_same_episode_twice_is_the_same(room):
     runs = []
     for _ in range(2):

@@ -10,11 +10,11 @@ from tyro.conf import Positional, arg
 
 from avp_habitat import command
 from avp_habitat.command import progress
-from avp_habitat.errors import RolloutError, SceneError, UsageError
+from avp_habitat.errors import AVPError, RolloutError, SceneError, UsageError
 from avp_habitat.metrics import FIGURES, GEOMETRY, explained
 from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.format import name_of, read_rollout
-from avp_habitat.rollout.seen import expect_scene
+from avp_habitat.rollout.origin import expect_scene, task_of
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
@@ -39,7 +39,7 @@ class GeometryOptions:
     simulator: SimulatorChoice = field(default_factory=SimulatorChoice)
     """Which simulator opens the scene."""
     camera_height: Annotated[float, Range(0.01, 10)] = TaskSettings.sensor_height_m
-    """Of the camera that says what can be seen, metres above the floor."""
+    """Of the camera that says what of the scene meshes should hold, metres above the floor; rollouts name theirs."""
     json: bool = False
     """Print JSON."""
 
@@ -47,11 +47,11 @@ class GeometryOptions:
         """Refuse what cannot be."""
         hold_ranges(self)
         if not self.shapes:
-            raise UsageError("shapes: expected at least one rollout folder or mesh")
+            raise UsageError("expected at least one rollout folder or mesh, got none")
 
 
 def report_on(path: Path, simulator: Simulator, settings: TaskSettings) -> dict[str, Any]:
-    """The figures of a rollout folder or a mesh, with what it is.
+    """The figures of a rollout folder or a mesh, with what it is; the settings are those of meshes.
 
     Raises:
         RolloutError: the rollout is damaged, of another scene, or shows no surface.
@@ -63,11 +63,11 @@ def report_on(path: Path, simulator: Simulator, settings: TaskSettings) -> dict[
     if path.suffix.lower() in _MESHES and not path.is_dir():
         return {"shape": str(path), "scene": simulator.scene, **_of_mesh(path, simulator, settings)}
     rollout = read_rollout(path)
-    scene, policy = (name_of(rollout.meta, name) for name in ("scene", "policy"))
     expect_scene(rollout, simulator)
-    figures = rollout_figures(rollout, scene_truth(simulator, settings))
+    figures = rollout_figures(rollout, scene_truth(simulator, task_of(rollout)))
     if not figures:
         raise RolloutError(f"{path}: expected depth pictures that show some surface, found none")
+    scene, policy = (name_of(rollout.meta, name) for name in ("scene", "policy"))
     return {"shape": str(path), "scene": scene, "policy": policy, "views": len(rollout.frames), **figures}
 
 
@@ -78,7 +78,7 @@ def _of_mesh(path: Path, simulator: Simulator, settings: TaskSettings) -> dict[s
     from avp_habitat.geometry.truth import scene_truth
     from avp_habitat.scenes.loader import load_scene
 
-    mesh = load_scene(path, up="y", origin=simulator.scene_frame.origin).mesh
+    mesh = load_scene(path, up="y", origin=(0.0, 0.0, 0.0)).mesh
     shape, truth = Shape(mesh.vertices, mesh.triangles), scene_truth(simulator, settings)
     if (fault := misplacement(shape, truth)) is not None:
         raise SceneError(f"{path}: expected a mesh in the frame of {simulator.scene}, but {fault}")
@@ -92,7 +92,21 @@ def main(options: GeometryOptions) -> None:
     settings = replace(TaskSettings(), sensor_height_m=options.camera_height)
     several = len(options.shapes) > 1
     waiting = progress(options.shapes, desc="measuring", unit="shape") if several else options.shapes
-    reports = [report_on(path, simulator, settings) for path in waiting]
+    reports, errors = [], []
+    for path in waiting:
+        try:
+            reports.append(report_on(path, simulator, settings))
+        except AVPError as error:
+            errors.append(error)
+    if reports:
+        _show(options, reports)
+    for error in errors[:-1]:
+        print(f"error: {error}", file=sys.stderr)
+    if errors:
+        raise errors[-1]
+
+
+def _show(options: GeometryOptions, reports: list[dict[str, Any]]) -> None:
     if options.json:
         print(json.dumps(reports, indent=2, allow_nan=False))
         return

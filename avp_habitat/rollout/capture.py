@@ -27,6 +27,7 @@ from avp_habitat.provenance import installed_versions
 from avp_habitat.rollout.drawing import draw_trajectory
 from avp_habitat.rollout.format import Rollout
 from avp_habitat.rollout.images import write_numbers, write_rgb
+from avp_habitat.rollout.origin import task_of
 from avp_habitat.rollout.seen import visibility_of
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.sight.heldout import VIEWS, heldout_poses, heldout_seed
@@ -98,7 +99,7 @@ def publish_rollout(
     # From the files, in whole millimetres, so that the figure is the one that a reader of the folder computes.
     seen = visibility_of(frames, views, writer.intrinsics).figures() if views else {}
     visibility = {name: seen[name] for name in ("visibility", "visibility_parallax") if name in seen}
-    shape = rollout_figures(rollout, scene_truth(env.simulator, env.settings)) if geometry else {}
+    shape = rollout_figures(rollout, scene_truth(env.simulator, task_of(rollout))) if geometry else {}
     metrics = info["avp_episode"] | visibility | shape | measured(env.settings.metrics, "rollout", rollout)
     about = {"policy": policy, "seed": seed, "metrics": metrics, "floor": floor, "mlflow_run_id": mlflow_run_id}
     writer.publish(rollout.meta | about)

@@ -33,8 +33,8 @@ class SimulatorElsewhere:
     def render(self, *_: Any, **__: Any) -> NoReturn:
         """Refused by a `SimulatorError`."""
         raise SimulatorError(
-            f"{self.scene}: its simulator is in another process and cannot be asked for views here; run a planner that "
-            "looks at the whole scene (oracle, survey) without SubprocVecEnv"
+            f"{self.scene}: its simulator is in another process and cannot be asked for views here; run a "
+            "planner that asks for views (nbv, oracle, survey) without SubprocVecEnv"
         )
 
     visible = render
@@ -50,7 +50,8 @@ class AgentView:
     settings: TaskSettings
     """Of the task: amounts of the actions, camera, range, budget."""
     simulator: Simulator
-    """The whole scene. Only a planner with full knowledge (the oracle) may ask it, or read cells not yet observed."""
+    """The whole scene. Only a planner with full knowledge (the oracle) may ask it for more than the newest view, or
+    read cells not yet observed."""
     position: NDArray[np.float64]
     """`(3,)` the feet, metres."""
     yaw: float

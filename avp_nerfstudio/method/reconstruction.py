@@ -35,9 +35,9 @@ from avp_habitat.command import progress
 from avp_habitat.provenance import git_commit, installed_versions
 from avp_habitat.rollout.format import Rollout
 from avp_habitat.rollout.images import write_rgb
+from avp_habitat.rollout.origin import task_of
 from avp_habitat.rollout.seen import visibility_of
 from avp_habitat.simulators.base import Simulator
-from avp_habitat.task.settings import TaskSettings
 from avp_habitat.tracking.stores import TrackingError
 from avp_nerfstudio.data.dataparser import AVPDataParserConfig
 from avp_nerfstudio.method.config import trainer_config
@@ -83,7 +83,7 @@ def process(
             Trainer.train(trainer)
         trained = time.monotonic()
         views = _score(trainer.pipeline, folder, options.pictures)
-        shape = {} if scene is None else model_figures(trainer.pipeline, scene, _task_of(rollout))
+        shape = {} if scene is None else model_figures(trainer.pipeline, scene, task_of(rollout))
     scored = time.monotonic()
     count = len(rollout.frames) if options.frames is None else options.frames
     seen = visibility_of(rollout.frames[:count], rollout.heldout, rollout.intrinsics)
@@ -116,14 +116,6 @@ def process(
     if address is not None:
         _track(address, config, folder, found)
     return found
-
-
-def _task_of(rollout: Rollout) -> TaskSettings:
-    """What the figures of geometry need of the task."""
-    camera, coverage = (rollout.meta.get(name, {}) for name in ("camera", "coverage"))
-    height, reach = camera.get("height_above_floor_m"), coverage.get("max_range_m")
-    given = {"sensor_height_m": height, "max_range_m": reach}
-    return TaskSettings(**{name: value for name, value in given.items() if value is not None})
 
 
 def _configuration(options: "Reconstruct", rollout: Rollout, outputs: Path) -> Any:

@@ -18,12 +18,12 @@ from avp_habitat.task.settings import LOOK_DOWN, LOOK_UP, MOVE_FORWARD, TURN_LEF
 
 Float = NDArray[np.float64]
 
-YAWS = 36
-"""Directions of rays around a candidate place, and of the views from there."""
+RAYS = 36
+"""Directions of rays around a candidate place; of the views from there at most as many."""
 ELEVATIONS_DEG = np.arange(-70.0, 71.0, 10.0)
 """Of those rays."""
-PITCHES_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
-"""Of the views."""
+STEEPEST_DEG, PITCH_STEP_DEG = 30.0, 10.0
+"""Greatest pitch of the views, and about how far apart they are."""
 SPACING_M = 0.5
 """Candidate places lie this far apart."""
 MOST_PLACES = 150
@@ -34,8 +34,7 @@ LOYALTY = 0.7
 """The view that was chosen before is left for one that is better by this factor."""
 _LEAST_GAIN = 0.02
 """Share of a view's rays that must lead into unknown space for a view to be worth going for."""
-_DEPTH_SIZE = 160, 120
-_ALIKE_RAD = np.radians(5.0)
+_DEPTH_WIDTH = 160
 _BODY_M = 0.2
 _NEAR_M = 0.4
 _HEAD_M, _STEP_M = 1.5, 0.2
@@ -44,7 +43,7 @@ _HEAD_M, _STEP_M = 1.5, 0.2
 
 @dataclass(frozen=True)
 class _Candidates:
-    """k reachable places, each with `YAWS` x pitches views."""
+    """k reachable places, each with views in the directions that turns and tilts can reach."""
 
     cells: NDArray[np.int64]
     """`(k, 2)` of the grid, along z and x."""
@@ -53,11 +52,13 @@ class _Candidates:
     first: NDArray[np.floating]
     """`(k,)` radians by which to turn to face the aim."""
     yaws: Float
-    """`(YAWS,)` radians; whole turns from the agent's."""
+    """`(y,)` radians; whole turns from the agent's."""
     pitches: Float
-    """Radians."""
+    """`(p,)` radians; whole tilts from the agent's, up to the task's limit."""
+    apart: tuple[float, float]
+    """How far yaws, and pitches, have to be apart to be other ones, radians."""
     actions: Float
-    """`(k, YAWS, pitches)` how many it takes to get there, at least 1."""
+    """`(k, y, p)` how many it takes to get there, at least 1."""
 
 
 class NextBestViewPlanner:
@@ -74,9 +75,11 @@ class NextBestViewPlanner:
     def act(self, view: AgentView) -> int:
         """The next action."""
         grid = self._grid = self._grid or OccupancyGrid(view.position)
-        camera, pose = Intrinsics.from_hfov(*_DEPTH_SIZE, hfov_deg=view.settings.hfov_deg), view.camera_to_world
+        settings, pose = view.settings, view.camera_to_world
+        height = max(1, round(_DEPTH_WIDTH * settings.height / settings.width))
+        camera = Intrinsics.from_hfov(_DEPTH_WIDTH, height, hfov_deg=settings.hfov_deg)
         depth = view.simulator.render(pose[None], camera, rgb=False).depth[0]
-        grid.integrate(depth, pose, camera, view.settings.max_range_m)
+        grid.integrate(depth, pose, camera, settings.max_range_m)
         if view.collided:
             ahead = np.array([-np.sin(view.yaw), 0.0, -np.cos(view.yaw)])
             self._blocked.append(view.position + ahead * (_BODY_M + VOXEL_M))
@@ -98,11 +101,11 @@ class NextBestViewPlanner:
     @staticmethod
     def _action(view: AgentView, found: _Candidates, place: int, yaw: float, pitch: float) -> int:
         """The first move, tilt or turn on the way to a candidate."""
-        turn, tilt = np.radians([view.settings.turn_deg, view.settings.tilt_deg])
+        turn = np.radians(view.settings.turn_deg)
         if found.aims[place] is not None:
             angle = found.first[place]
             return MOVE_FORWARD if abs(angle) <= turn / 2 + 1e-9 else (TURN_LEFT if angle > 0 else TURN_RIGHT)
-        if abs(pitch - view.pitch) > tilt / 2:
+        if abs(pitch - view.pitch) > 1e-6:
             return LOOK_UP if pitch > view.pitch else LOOK_DOWN
         return TURN_LEFT if wrap_angle(np.array(yaw - view.yaw)) >= 0 else TURN_RIGHT
 
@@ -116,13 +119,15 @@ class NextBestViewPlanner:
         cells = cells[np.argsort(length[tuple(cells.T)], kind="stable")][:MOST_PLACES]
         aims = [_aim(passable, before, at, cell) for cell in cells]
         headings = np.array([view.yaw if aim is None else np.arctan2(at[1] - aim[1], at[0] - aim[0]) for aim in aims])
-        yaws = view.yaw + np.arange(YAWS) * 2 * np.pi / YAWS
-        pitches, first = np.radians(PITCHES_DEG), wrap_angle(headings - view.yaw)
+        turn, tilt = np.radians([settings.turn_deg, settings.tilt_deg])
+        yaws, pitches = _yaws(view.yaw, turn), _pitches(view, tilt)
+        first = wrap_angle(headings - view.yaw)
         turns = np.abs(wrap_angle(yaws - headings[:, None])) + np.abs(first)[:, None]
-        tilts = np.abs(pitches - view.pitch) / np.radians(settings.tilt_deg)
+        tilts = np.abs(pitches - view.pitch) / tilt
         moves = length[tuple(cells.T)] * VOXEL_M / settings.forward_m
-        actions = moves[:, None, None] + turns[:, :, None] / np.radians(settings.turn_deg) + tilts
-        return _Candidates(cells, aims, first, yaws, pitches, np.maximum(actions, 1.0))
+        actions = moves[:, None, None] + turns[:, :, None] / turn + tilts
+        apart = max(turn, 2 * np.pi / RAYS) / 2, max(tilt, np.radians(PITCH_STEP_DEG)) / 2
+        return _Candidates(cells, aims, first, yaws, pitches, apart, np.maximum(actions, 1.0))
 
     def _passable(self, view: AgentView, grid: OccupancyGrid) -> NDArray[np.bool_]:
         """`(z, x)` columns of the grid that the agent's body can be in, as far as known."""
@@ -144,6 +149,21 @@ class NextBestViewPlanner:
         return (free & ~obstacle & (near | ~binary_dilation(obstacle, disc))).T  # type: ignore[operator]
 
 
+def _yaws(yaw: float, turn: float) -> Float:
+    """`(y,)` yaws that whole turns reach, no denser than the rays."""
+    every = max(1, int(2 * np.pi / RAYS / turn + 1e-6)) * turn
+    return yaw + every * np.arange(max(1, round(2 * np.pi / every)))
+
+
+def _pitches(view: AgentView, tilt: float) -> Float:
+    """`(p,)` pitches that whole tilts reach, the agent's own among them."""
+    every = max(1, round(np.radians(PITCH_STEP_DEG) / tilt)) * tilt
+    limit, count = np.radians(view.settings.pitch_limit_deg), int(np.pi / every)
+    found = np.clip(view.pitch + every * np.arange(-count, count + 1), -limit, limit)
+    level = np.abs(found) <= np.radians(STEEPEST_DEG) + 1e-6
+    return np.unique(np.asarray([*found[level], view.pitch], np.float64))
+
+
 def _aim(passable: NDArray[np.bool_], before: NDArray[np.int64], at: Float, cell: NDArray[np.int64]) -> Float | None:
     """Where to walk straight to from a place `(2,)` on the way to a cell; None for who is there."""
     if np.hypot(*(cell + 0.5 - at)) * VOXEL_M < SPACING_M / 4:
@@ -153,33 +173,33 @@ def _aim(passable: NDArray[np.bool_], before: NDArray[np.int64], at: Float, cell
 
 
 def _alike(found: _Candidates, views: Float) -> NDArray[np.bool_]:
-    """`(k, YAWS, pitches)` whether candidates are like any of `(t, 4)` views: they will not show more."""
+    """`(k, y, p)` whether candidates are like any of `(t, 4)` views: they will not show more."""
     places = np.linalg.norm((found.cells + 0.5) * VOXEL_M - views[:, None, :2], axis=-1) < SPACING_M / 2
-    yaws = np.abs(wrap_angle(found.yaws - views[:, 2:3])) < np.pi / YAWS
-    pitches = np.abs(found.pitches - views[:, 3:]) < _ALIKE_RAD
+    yaws = np.abs(wrap_angle(found.yaws - views[:, 2:3])) < found.apart[0]
+    pitches = np.abs(found.pitches - views[:, 3:]) < found.apart[1]
     return np.einsum("tk,ty,tp->kyp", places, yaws, pitches, dtype=np.int64) > 0
 
 
 def _gains(grid: OccupancyGrid, found: _Candidates, view: AgentView) -> Float:
-    """`(k, YAWS, pitches)` information gain of candidates, in voxels for each of a view's rays."""
+    """`(k, y, p)` information gain of candidates, in voxels for each of a view's rays."""
     settings, cells = view.settings, found.cells
     eyes = np.zeros((len(cells), 3))
     eyes[:, [2, 0]] = (cells + 0.5) * VOXEL_M + grid.corner[[2, 0]]
     eyes[:, 1] = view.position[1] + settings.sensor_height_m
     elevations = np.radians(ELEVATIONS_DEG)
-    yaw, elevation = (each.ravel() for each in np.meshgrid(found.yaws, elevations, indexing="ij"))
+    around = view.yaw + np.arange(RAYS) * 2 * np.pi / RAYS
+    yaw, elevation = (each.ravel() for each in np.meshgrid(around, elevations, indexing="ij"))
     directions = np.stack(
         [-np.sin(yaw) * np.cos(elevation), np.sin(elevation), -np.cos(yaw) * np.cos(elevation)], axis=1
     )
-    rays = grid.gains(eyes, directions, settings.max_range_m, REAR_SIDE).reshape(len(cells), YAWS, len(elevations))
-    weighted = rays * np.cos(elevations)
-    camera = settings.intrinsics
-    half_yaws = round(np.arctan(camera.width / 2 / camera.fx) / (2 * np.pi / YAWS))
-    half_pitch = np.arctan(camera.height / 2 / camera.fy)
-    around = sum(np.roll(weighted, shift, axis=1) for shift in range(-half_yaws, half_yaws + 1))
-    shown = np.abs(elevations[:, None] - found.pitches) <= half_pitch
-    rays_of_view = (2 * half_yaws + 1) * (np.cos(elevations)[:, None] * shown).sum(axis=0)
-    return around @ shown.astype(np.float64) / rays_of_view
+    rays = grid.gains(eyes, directions, settings.max_range_m, REAR_SIDE).reshape(len(cells), RAYS, len(elevations))
+    camera, solid = settings.intrinsics, np.cos(elevations)
+    half_yaw = max(np.arctan(camera.width / 2 / camera.fx), np.pi / RAYS)
+    half_pitch = max(np.arctan(camera.height / 2 / camera.fy), np.radians(5.0))
+    across = np.abs(wrap_angle(around[:, None] - found.yaws)) <= half_yaw + 1e-6
+    along = (np.abs(elevations[:, None] - found.pitches) <= half_pitch + 1e-6) * solid[:, None]
+    seen = np.einsum("kre,ry,ep->kyp", rays, across.astype(float), along, optimize=True)
+    return seen / (across.sum(axis=0)[:, None] * along.sum(axis=0))
 
 
 class NextBestViewPolicy(PlanningPolicy):
