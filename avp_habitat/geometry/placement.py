@@ -15,6 +15,8 @@ _NEAR_M = 0.1
 """Coarser than the figures': a reconstruction is no exact copy."""
 _CLEARLY = 0.2
 """Another frame explains a shape in which so much more of the scene would be found."""
+_WHOLE, _NOT_WHOLE = 0.95, 0.9
+"""Or one in which all of it is found, where it was not."""
 _DOUBTFUL = 0.5
 """A shape of which more lies near the scene is not said to be merely moved."""
 _AXES = "XYZ"
@@ -50,7 +52,9 @@ def misplacement(shape: Shape, truth: SceneTruth) -> str | None:
         then_near, then_found = _near(frame, shape, points, truth, seen)
         if then_found > best and then_near >= max(_DOUBTFUL, near - 0.05):
             best, words = then_found, frame.words
-    if words is None or best < found + _CLEARLY:
+    # The walls of a room that is mirrored are where they were: much else is not.
+    explained = best >= found + _CLEARLY or (best >= _WHOLE and found <= _NOT_WHOLE)
+    if words is None or not explained:
         return None
     of = f"of what can be seen {100 * found:.0f} % lie within {100 * _NEAR_M:g} cm of it"
     return f"it lies {words}: {of}, {100 * best:.0f} % would, were it put right"
