@@ -70,7 +70,7 @@ class Collect:
     height: Annotated[int, Range(8, 8192)] = 480
     """Of the pictures in pixels."""
     geometry: bool = False
-    """Also measure how true the fused depth is (accuracy, completion …); takes some seconds."""
+    """Also measure how true the fused depth is (accuracy, completion …); takes ten seconds or more."""
     stochastic: bool = False
     """Sample a model's actions instead of taking the likeliest."""
     trusted: Annotated[bool, arg(help=TRUSTED)] = False

@@ -30,7 +30,7 @@ _MEANING = explained(*(FIGURES[name].title for name in GEOMETRY))
 class GeometryOptions:
     """How true the shapes of rollouts (their depth, fused) and of meshes in the scene's frame are.
 
-    The scene is looked at as the task's camera looks at it. Takes some seconds for each.
+    The scene is looked at as the task's camera looks at it. Takes ten seconds or more for each.
     """
 
     shapes: Positional[tuple[Path, ...]]
