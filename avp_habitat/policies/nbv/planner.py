@@ -152,7 +152,7 @@ class NextBestViewPlanner:
 def _yaws(yaw: float, turn: float) -> Float:
     """`(y,)` yaws that whole turns reach, no denser than the rays."""
     every = max(1, int(2 * np.pi / RAYS / turn + 1e-6)) * turn
-    return yaw + every * np.arange(max(1, round(2 * np.pi / every)))
+    return np.asarray(yaw + every * np.arange(max(1, round(2 * np.pi / every))), np.float64)
 
 
 def _pitches(view: AgentView, tilt: float) -> Float:
