@@ -11,8 +11,9 @@ from tyro.conf import arg
 
 from avp_habitat import command
 from avp_habitat.command import progress
-from avp_habitat.errors import RolloutError
+from avp_habitat.errors import AVPError, RolloutError
 from avp_habitat.files import check_writable
+from avp_habitat.geometry.truth import scene_truth
 from avp_habitat.metrics import METRICS_HELP
 from avp_habitat.plugins import name_of
 from avp_habitat.policies.registry import (
@@ -31,7 +32,7 @@ from avp_habitat.rollout.capture import capture_heldout, capture_step, publish_r
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.sight.heldout import VIEWS
-from avp_habitat.simulators.base import Meshed
+from avp_habitat.simulators.base import Simulator
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.task.budget import BUDGET_HELP, Budget, budget_for
 from avp_habitat.task.rewards import REWARDS_HELP
@@ -106,14 +107,11 @@ def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: 
         AVPError: the scene, the simulator, the policy or the disk cannot be used; nothing is left behind.
     """
     check_policy(options.policy)
-    camera = Intrinsics.from_hfov(options.width, options.height, hfov_deg=TaskSettings.hfov_deg)
+    camera = Intrinsics.from_hfov(options.width, options.height, hfov_deg=(settings or TaskSettings).hfov_deg)
     with RolloutWriter(options.out, camera) as writer:
         simulator = open_simulator(options.simulator, options.scene)
         settings = settings or _settings(options, simulator.area.area_m2)
-        geometry = options.geometry and isinstance(simulator, Meshed)
-        if options.geometry and not geometry:
-            text = f"geometry is left out: the simulator {simulator.name} gives no mesh to compare with"
-            print(f"warning: {text}", file=sys.stderr)
+        geometry = options.geometry and _knows_truth(simulator, settings, camera)
         env, policy = make_policy_env(
             options.policy,
             simulator,
@@ -140,6 +138,16 @@ def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: 
             geometry=geometry,
             mlflow_run_id=getattr(policy, "avp_mlflow_run_id", None) or os.environ.get("MLFLOW_RUN_ID"),
         )
+
+
+def _knows_truth(simulator: Simulator, settings: TaskSettings, camera: Intrinsics) -> bool:
+    """Whether geometry can be measured; said before anything is captured, where it cannot."""
+    try:
+        scene_truth(simulator, replace(settings, width=camera.width, height=camera.height))
+    except AVPError as error:
+        print(f"warning: geometry is left out: {error}", file=sys.stderr)
+        return False
+    return True
 
 
 def _track(out: Path, option: str, experiment: str | None) -> None:

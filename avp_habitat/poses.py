@@ -83,10 +83,10 @@ def yaw_and_pitch(pose: Float) -> tuple[Float, Float]:
     return np.arctan2(-forward[..., 0], -forward[..., 2]), np.arcsin(np.clip(forward[..., 1], -1.0, 1.0))
 
 
-def heading(yaw: Float) -> NDArray[np.float64]:
-    """`(n, 3)` unit vectors on the floor along which agents with `(n,)` yaw angles in radians walk."""
-    yaw = np.asarray(yaw, dtype=np.float64)
-    return np.stack([-np.sin(yaw), np.zeros_like(yaw), -np.cos(yaw)], axis=-1)
+def heading(yaw: Float, pitch: Float | float = 0.0) -> NDArray[np.float64]:
+    """`(n, 3)` unit vectors along which agents with `(n,)` yaws and pitches in radians look; level, they walk there."""
+    yaw, pitch = np.broadcast_arrays(np.asarray(yaw, np.float64), np.asarray(pitch, np.float64))
+    return np.stack([-np.sin(yaw) * np.cos(pitch), np.sin(pitch), -np.cos(yaw) * np.cos(pitch)], axis=-1)
 
 
 def wrap_angle(angle: Float) -> Float:

@@ -4,7 +4,7 @@ import contextlib
 import io
 import json
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -13,10 +13,8 @@ from tyro.conf import Positional, arg
 from avp_habitat import command
 from avp_habitat.errors import RolloutError
 from avp_habitat.metrics import FIGURES, GEOMETRY, explained
-from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.scenes.location import HELP as SCENES
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
-from avp_habitat.task.settings import TaskSettings
 
 
 @dataclass(frozen=True)
@@ -33,14 +31,8 @@ class ModelGeometry:
     scene: Annotated[str, arg(help=SCENES)]
     simulator: SimulatorChoice = field(default_factory=SimulatorChoice)
     """Which simulator opens the scene."""
-    camera_height: Annotated[float, Range(0.01, 10)] = TaskSettings.sensor_height_m
-    """Of the cameras from which the model is looked at, metres above the floor."""
     json: bool = False
     """Print JSON."""
-
-    def __post_init__(self) -> None:
-        """Hold the ranges."""
-        hold_ranges(self)
 
 
 def main(options: ModelGeometry) -> None:
@@ -58,13 +50,13 @@ def main(options: ModelGeometry) -> None:
     # nerfstudio's scripts come first: its modules import each other in circles, and this way round is its own.
     import nerfstudio.scripts.eval  # noqa: F401
 
-    from avp_nerfstudio.method.shape import model_figures
+    from avp_nerfstudio.method.shape import model_figures, rollout_of
 
     simulator = open_simulator(options.simulator, options.scene)
-    settings = replace(TaskSettings(), sensor_height_m=options.camera_height)
     # nerfstudio says on standard output that it has loaded a checkpoint.
     with contextlib.redirect_stdout(io.StringIO()):
-        figures = model_figures(open_trained(read_config(path)).pipeline, simulator, settings)
+        pipeline = open_trained(read_config(path)).pipeline
+        figures = model_figures(pipeline, rollout_of(pipeline), simulator)
     if not figures:
         raise RolloutError(f"{path}: expected a model that shows some surface in {options.scene}, found none")
     if options.json:

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from avp_habitat.command import progress
 from avp_habitat.errors import UsageError
-from avp_habitat.policies.registry import make_policy
+from avp_habitat.policies.registry import make_policy_env, steps_of
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
-from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.settings import TaskSettings
 
 EPISODES_OF_A_SCENE = 2
@@ -77,40 +77,28 @@ def demonstrate(
     count = min(len(scenes), -(-episodes // EPISODES_OF_A_SCENE))
     chosen = [str(scenes[round(index)]) for index in np.linspace(0, len(scenes) - 1, count).tolist()]
     shown: list[Demonstrations] = []
-    numbers = itertools.count()
-    with progress(total=episodes, unit="episode", desc=f"watching {policy}") as bar:
-        for scene in itertools.cycle(chosen):
-            simulator = open_simulator(choice or SimulatorChoice(), scene)
-            for number in itertools.islice(numbers, EPISODES_OF_A_SCENE):
-                if number == episodes:
-                    return Demonstrations(*(np.concatenate(each) for each in zip(*map(_arrays, shown), strict=True)))
-                shown.append(_episode(policy, simulator, settings, number, gamma, seed + number))
-                bar.update()
-    raise AssertionError("scenes come again until there are enough episodes")
-
-
-def _arrays(shown: Demonstrations) -> tuple[NDArray, ...]:
-    return shown.observation, shown.action, shown.returned, shown.episode
+    for number in progress(range(episodes), unit="episode", desc=f"watching {policy}"):
+        if number % EPISODES_OF_A_SCENE == 0:
+            simulator = open_simulator(choice or SimulatorChoice(), chosen[number // EPISODES_OF_A_SCENE % count])
+        shown.append(_episode(policy, simulator, settings, number, gamma, seed + number))
+    return Demonstrations(*map(np.concatenate, zip(*(vars(each).values() for each in shown), strict=True)))
 
 
 def _episode(
     policy: str, simulator: Simulator, settings: TaskSettings, number: int, gamma: float, seed: int
 ) -> Demonstrations:
-    env = AVPEnv(simulator=simulator, settings=settings)
-    acting = make_policy(policy, env, seed)
-    observation, _ = env.reset(seed=seed)
-    if not isinstance(observation, np.ndarray):
-        raise UsageError(f"imitate: expected an observation that is one array, got {type(observation).__name__}")
-    seen, actions, rewards, state, first, ended = [], [], [], None, np.array([True]), False
-    while not ended:
-        chosen, state = acting.predict(observation, state, first, deterministic=True)
-        seen.append(np.array(observation, np.float32))
-        actions.append(int(np.asarray(chosen).item()))
-        observation, reward, terminated, truncated, _ = env.step(actions[-1])
-        rewards.append(float(reward))
-        first, ended = np.array([False]), terminated or truncated
-    returned = list(itertools.accumulate(reversed(rewards), lambda later, reward: reward + gamma * later))[::-1]
-    return Demonstrations(np.stack(seen), np.array(actions), np.array(returned, np.float32), np.full(len(seen), number))
+    env, acting = make_policy_env(policy, simulator, settings, seed=seed, observation=settings.observation)
+    if not isinstance(env.observation_space, Box):
+        raise UsageError(f"imitate: expected an observation that is one array, got {env.observation_space}")
+    steps = list(steps_of(env, acting, seed=seed))
+    rewards = (step.reward for step in reversed(steps))
+    returned = list(itertools.accumulate(rewards, lambda later, reward: reward + gamma * later))[::-1]
+    return Demonstrations(
+        np.stack([np.array(step.observation, np.float32) for step in steps]),
+        np.array([step.action for step in steps]),
+        np.array(returned, np.float32),
+        np.full(len(steps), number),
+    )
 
 
 def imitate(model: Any, shown: Demonstrations) -> ImitationFit:

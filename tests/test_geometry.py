@@ -241,4 +241,4 @@ def test_a_simulator_without_a_mesh_collects_without_geometry(tmp_path, capsys):
         "a", "spin", tmp_path / "r", simulator=choice, budget=3, width=32, height=24, geometry=True
     )
     assert "accuracy_m" not in collect.collect(options)
-    assert "geometry is left out: the simulator corridor gives no mesh" in capsys.readouterr().err
+    assert "geometry is left out: corridor: the simulator corridor gives no mesh" in capsys.readouterr().err

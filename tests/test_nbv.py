@@ -48,7 +48,7 @@ def marched(state, eye, direction, reach, rear_side, step=0.002):
 
 def test_gains_are_those_of_rays_that_march_in_small_steps():
     rng = np.random.default_rng(0)
-    grid = OccupancyGrid(np.zeros(3))
+    grid = OccupancyGrid(np.zeros(3), 10.0)
     grid.state[:] = rng.choice([UNKNOWN, FREE, FREE, FREE, OCCUPIED], grid.state.shape, p=[0.1, 0.3, 0.3, 0.2, 0.1])
     eyes = rng.uniform(-1, 1, (5, 3)) + [0, 1.5, 0]
     directions = rng.normal(size=(40, 3))
@@ -61,10 +61,26 @@ def test_gains_are_those_of_rays_that_march_in_small_steps():
     assert found.max() > 1
 
 
+def test_the_grid_grows_around_who_walks_on_and_keeps_what_it_knew():
+    grid = OccupancyGrid(np.array([3.0, 0.0, 4.0]), 10.0)
+    known = np.array([5.05, 1.05, -2.95])
+    grid.state[tuple(((known - grid.corner) / VOXEL_M).astype(int))] = OCCUPIED
+    for feet in ([30.0, 0.0, 4.0], [3.0, 6.5, -40.0], [3.0, -3.0, 4.0]):
+        grid.cover(np.array(feet), 10.0)
+        least, most = grid.corner, grid.corner + np.array(grid.state.shape) * VOXEL_M
+        assert (least <= np.array(feet) - [10, 1, 10]).all()
+        assert (most >= np.array(feet) + [10, 4, 10]).all()
+    assert grid.state[tuple(((known - grid.corner) / VOXEL_M).astype(int))] == OCCUPIED
+    assert (grid.state == OCCUPIED).sum() == 1
+    size = grid.state.shape
+    grid.cover(np.array([3.0, 0.0, 4.0]), 1000.0)
+    assert grid.state.size < 4 * np.prod(size)
+
+
 def test_depth_frees_the_way_and_occupies_what_it_hits(room):
     poses = heldout_poses(room, sensor_height_m=1.5)
     depth = room.render(poses, CAMERA, rgb=False).depth
-    grid = OccupancyGrid(poses[0, :3, 3] - [0, 1.5, 0])
+    grid = OccupancyGrid(poses[0, :3, 3] - [0, 1.5, 0], 10.0)
     for image, pose in zip(depth, poses, strict=True):
         grid.integrate(image, pose, CAMERA, 10.0)
     occupied = np.argwhere(grid.state == OCCUPIED) * VOXEL_M + grid.corner + VOXEL_M / 2
@@ -79,7 +95,7 @@ def test_depth_frees_the_way_and_occupies_what_it_hits(room):
 
 def test_a_picture_leaves_nothing_to_gain_where_it_looked(room):
     pose = heldout_poses(room, sensor_height_m=1.5)[:1]
-    grid = OccupancyGrid(pose[0, :3, 3] - [0, 1.5, 0])
+    grid = OccupancyGrid(pose[0, :3, 3] - [0, 1.5, 0], 10.0)
     ahead = -pose[0, :3, 2]
     assert grid.gains(pose[:, :3, 3], ahead[None], 10.0, 2.0)[0, 0] == pytest.approx(2.0, abs=0.02)
     grid.integrate(room.render(pose, CAMERA, rgb=False).depth[0], pose[0], CAMERA, 10.0)

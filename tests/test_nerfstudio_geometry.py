@@ -11,14 +11,12 @@ pytest.importorskip("nerfstudio")
 
 from avp_habitat import collect, command
 from avp_habitat.errors import RolloutError
-from avp_habitat.geometry.truth import scene_truth
 from avp_habitat.metrics import GEOMETRY
 from avp_habitat.poses import z_up_to_y_up
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
-from avp_habitat.task.settings import TaskSettings
 from avp_nerfstudio import geometry, reconstruct
 from avp_nerfstudio.data.dataparser import AVPDataParserConfig
-from avp_nerfstudio.method.shape import model_figures
+from avp_nerfstudio.method.shape import model_figures, rollout_of
 
 
 @pytest.fixture(scope="module")
@@ -46,26 +44,27 @@ class TrueModel:
         return {"depth": depth, "accumulation": torch.ones_like(depth)}
 
 
-def pipeline_of(model, scale, parser=None):
+def pipeline_of(model, scale, parser):
     manager = SimpleNamespace(
-        config=SimpleNamespace(dataparser=parser or AVPDataParserConfig()),
+        config=SimpleNamespace(dataparser=parser),
         train_dataparser_outputs=SimpleNamespace(dataparser_scale=scale),
     )
-    return SimpleNamespace(model=model, datamanager=manager, device="cpu", eval=lambda: None)
+    return SimpleNamespace(model=model, datamanager=manager, device="cpu")
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.25])
-def test_a_model_that_is_the_scene_is_scored_as_the_scene(simulator, scale):
-    found = model_figures(pipeline_of(TrueModel(simulator, scale), scale), simulator, TaskSettings())
+def test_a_model_that_is_the_scene_is_scored_as_the_scene(simulator, rollout, scale):
+    pipeline = pipeline_of(TrueModel(simulator, scale), scale, AVPDataParserConfig(data=rollout))
+    found = model_figures(pipeline, rollout_of(pipeline), simulator)
     assert found["accuracy_m"] < 0.01
     assert found["precision"] > 0.98
     assert found["completion_ratio"] > 0.7
 
 
 def test_a_model_of_another_parser_has_no_known_frame(simulator):
-    other = SimpleNamespace()
+    pipeline = pipeline_of(TrueModel(simulator, 1.0), 1.0, SimpleNamespace())
     with pytest.raises(RolloutError, match="avp-data, whose frame is the rollout's, found SimpleNamespace"):
-        model_figures(pipeline_of(TrueModel(simulator, 1.0), 1.0, other), simulator, TaskSettings())
+        rollout_of(pipeline)
 
 
 @pytest.fixture(scope="module")
@@ -76,9 +75,7 @@ def rollout(tmp_path_factory):
     return folder
 
 
-def test_a_reconstruction_measures_its_shape_and_a_checkpoint_has_the_same(
-    rollout, tmp_path, capsys, monkeypatch, simulator
-):
+def test_a_reconstruction_measures_its_shape_and_a_checkpoint_has_the_same(rollout, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     out = tmp_path / "out"
     words = [str(rollout), "--out", str(out), "--iterations", "40", "--scene", "builtin:3", "--keep-checkpoint"]
@@ -90,8 +87,8 @@ def test_a_reconstruction_measures_its_shape_and_a_checkpoint_has_the_same(
     assert command.run(geometry.main, [str(out), "--scene", "builtin:3", "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
     assert {name: again[name] for name in GEOMETRY} == pytest.approx(kept, rel=0.02)
-    # The truth is that of the whole scene.
-    assert len(scene_truth(simulator, TaskSettings()).observable) > 10_000
+    assert command.run(geometry.main, [str(out), "--scene", "builtin:4"]) == 1
+    assert "expected a rollout of builtin:4, found one of builtin:3" in capsys.readouterr().err
 
 
 def test_a_rollout_of_another_scene_is_refused_before_it_is_trained_on(rollout, tmp_path, capsys):

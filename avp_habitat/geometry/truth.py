@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from avp_habitat.errors import SimulatorError, UsageError
 from avp_habitat.geometry.shape import Shape
 from avp_habitat.poses import Intrinsics, wrap_angle
+from avp_habitat.scenes.mesh import without_holes
 from avp_habitat.sight.heldout import heldout_poses
 from avp_habitat.sight.tables import once_per_simulator
 from avp_habitat.simulators.base import Meshed, Simulator
@@ -28,7 +29,7 @@ CAMERA = Intrinsics.from_hfov(160, 120, hfov_deg=90.0)
 SCAN_VIEWS = 60
 """Depth images of a model that are fused."""
 _GOLDEN_RAD = np.pi * (3 - 5**0.5)
-_TOLERANCE_M = 0.005
+_TOLERANCE_M, _PIECE_M = 0.005, 0.02
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def scene_truth(
     """
     if not isinstance(simulator, Meshed):
         raise SimulatorError(f"{simulator.scene}: the simulator {simulator.name} gives no mesh to compare with")
-    mesh = simulator.surface_mesh()
+    mesh = without_holes(simulator.surface_mesh(), _PIECE_M)
     whole = Shape(mesh.vertices, mesh.triangles)
     points = whole.samples(samples)
     centres = simulator.area.centres

@@ -239,6 +239,8 @@ def observation_of(weights: Path) -> str:
 class Step:
     """What one step of the environment gave."""
 
+    observation: Any
+    """By which the action was chosen."""
     action: int
     """Number of the action taken."""
     reward: float
@@ -259,8 +261,8 @@ def steps_of(env: gymnasium.Env, policy: Policy, *, seed: int, deterministic: bo
     ended = False
     while not ended:
         chosen, state = policy.predict(observation, state, first, deterministic=deterministic)
-        action = int(np.asarray(chosen).item())
+        action, seen = int(np.asarray(chosen).item()), observation
         observation, reward, terminated, truncated, info = env.step(action)
         first = np.array([False])
         ended = terminated or truncated
-        yield Step(action, float(reward), info)
+        yield Step(seen, action, float(reward), info)

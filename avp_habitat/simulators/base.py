@@ -122,7 +122,7 @@ class Meshed(Simulator, Protocol):
     """A simulator that can say where all the surface of its scene is; ask for it by `isinstance`."""
 
     def surface_mesh(self) -> TexturedMesh:
-        """The scene's triangles, world frame, without the holes of masked ones.
+        """The scene's triangles, world frame, metres.
 
         Raises:
             SceneError: they cannot be read.

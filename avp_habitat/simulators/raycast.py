@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from avp_habitat.simulators.shading import Surface
 
 _RAYS_PER_CALL = 1 << 20
-_HOLE_M = 0.02
-"""Edges of the pieces of masked surfaces, metres."""
 _BEYOND_M = np.float32(1e-4)
 """How far behind a hole of a surface its rays begin anew, in metres."""
 
@@ -156,9 +154,7 @@ class RaycastSimulator:
 
     def surface_mesh(self) -> "TexturedMesh":
         """All surfaces; see `simulators.base.Meshed.surface_mesh`."""
-        from avp_habitat.scenes.mesh import without_holes
-
-        return without_holes(self._mesh, _HOLE_M)
+        return self._mesh
 
     def close(self) -> None:
         """Free nothing: the memory goes with the object."""

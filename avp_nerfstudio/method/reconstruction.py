@@ -35,7 +35,6 @@ from avp_habitat.command import progress
 from avp_habitat.provenance import git_commit, installed_versions
 from avp_habitat.rollout.format import Rollout
 from avp_habitat.rollout.images import write_rgb
-from avp_habitat.rollout.origin import task_of
 from avp_habitat.rollout.seen import visibility_of
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.tracking.stores import TrackingError
@@ -83,7 +82,7 @@ def process(
             Trainer.train(trainer)
         trained = time.monotonic()
         views = _score(trainer.pipeline, folder, options.pictures)
-        shape = {} if scene is None else model_figures(trainer.pipeline, scene, task_of(rollout))
+        shape = {} if scene is None else model_figures(trainer.pipeline, rollout, scene)
     scored = time.monotonic()
     count = len(rollout.frames) if options.frames is None else options.frames
     seen = visibility_of(rollout.frames[:count], rollout.heldout, rollout.intrinsics)

@@ -14,8 +14,9 @@ from avp_habitat.geometry.fusion import fuse
 from avp_habitat.geometry.scores import score
 from avp_habitat.geometry.truth import CAMERA, scan_poses, scene_truth
 from avp_habitat.poses import pixel_directions
+from avp_habitat.rollout.format import Rollout, read_rollout
+from avp_habitat.rollout.origin import expect_scene, task_of
 from avp_habitat.simulators.base import Simulator
-from avp_habitat.task.settings import TaskSettings
 from avp_nerfstudio.data.dataparser import AVPDataParserConfig, nerfstudio_poses
 from avp_nerfstudio.method.hash_encoding import compile_hash_encodings
 
@@ -23,18 +24,33 @@ _OPAQUE = 0.5
 """Rays of which less than this share ends in the model show no surface."""
 
 
-def model_figures(pipeline: Any, simulator: Simulator, settings: TaskSettings) -> dict[str, float]:
+def rollout_of(pipeline: Any) -> Rollout:
+    """The rollout on which a pipeline was trained.
+
+    Raises:
+        RolloutError: it cannot be read, or the data came in by another parser, so that nobody knows the model's frame.
+    """
+    parser = pipeline.datamanager.config.dataparser
+    if not isinstance(parser, AVPDataParserConfig):
+        found = type(parser).__name__
+        raise RolloutError(f"expected a training on avp-data, whose frame is the rollout's, found {found}")
+    return read_rollout(parser.data)
+
+
+def model_figures(pipeline: Any, rollout: Rollout, simulator: Simulator) -> dict[str, float]:
     """How true the shape of a model is, by the names of `metrics.GEOMETRY`; nothing where it shows no surface.
 
     Args:
-        pipeline: nerfstudio's, trained on a rollout of the scene through avp-data.
-        simulator: of the scene.
-        settings: of the task: camera height, range.
+        pipeline: nerfstudio's, in evaluation mode, trained on the rollout through avp-data.
+        rollout: says camera height and range.
+        simulator: of its scene.
 
     Raises:
-        RolloutError: the data came in by another parser, so that nobody knows the model's frame.
+        RolloutError: the rollout is of another scene.
         SimulatorError: the simulator gives no mesh.
     """
+    expect_scene(rollout, simulator)
+    settings = task_of(rollout)
     truth = scene_truth(simulator, settings)
     poses = scan_poses(simulator, settings)
     views = progress(_views(pipeline, poses), total=len(poses), unit="view", desc="scanning the model")
@@ -44,12 +60,6 @@ def model_figures(pipeline: Any, simulator: Simulator, settings: TaskSettings) -
 
 def _views(pipeline: Any, poses: NDArray[np.float64]) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float64]]]:
     """The depth in metres that a model shows from habitat poses `(n, 4, 4)`, 0 for none, with the pose."""
-    parser = pipeline.datamanager.config.dataparser
-    if not isinstance(parser, AVPDataParserConfig):
-        raise RolloutError(
-            f"expected a training on avp-data, whose frame is the rollout's, found {type(parser).__name__}"
-        )
-    pipeline.eval()
     compile_hash_encodings(pipeline.model)
     scale = pipeline.datamanager.train_dataparser_outputs.dataparser_scale
     length = np.linalg.norm(pixel_directions(CAMERA), axis=-1)

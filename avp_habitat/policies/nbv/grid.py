@@ -15,25 +15,35 @@ Float = NDArray[np.floating]
 UNKNOWN, FREE, OCCUPIED = range(3)
 VOXEL_M = 0.1
 """Side of a voxel, metres."""
-_SIDE_M, _BELOW_M, _ABOVE_M = 32.0, 1.0, 4.0
-"""The grid's width, and how far it goes below and above the first agent's feet, metres."""
+_BELOW_M, _ABOVE_M, _FARTHEST_M = 1.0, 4.0, 16.0
+"""The grid holds so much below and above an agent's feet, and at least its range to all sides, but not more than this;
+metres."""
+_GROWTH = 40
+"""It grows by so many voxels at a time."""
 _CLEAR = 0.5
 """Probability that a ray passes an unknown voxel."""
 
 
 class OccupancyGrid:
-    """What depth images have shown, in voxels around the place of the first one.
+    """What depth images have shown, in voxels; what lies beyond the grid is taken as known."""
 
-    What lies beyond the grid is taken as known.
-    """
-
-    def __init__(self, feet: Float) -> None:
+    def __init__(self, feet: Float, range_m: float) -> None:
         """Know nothing around `(3,)` metres."""
-        size = np.array([_SIDE_M, _BELOW_M + _ABOVE_M, _SIDE_M])
-        self.corner = np.asarray(feet, np.float64) - [_SIDE_M / 2, _BELOW_M, _SIDE_M / 2]
+        self.corner = np.floor(np.asarray(feet, np.float64) / VOXEL_M) * VOXEL_M
         """`(3,)` least corner, metres."""
-        self.state = np.zeros(tuple(np.ceil(size / VOXEL_M).astype(int)), np.uint8)
+        self.state = np.zeros((1, 1, 1), np.uint8)
         """`(x, y, z)` UNKNOWN, FREE or OCCUPIED."""
+        self.cover(feet, range_m)
+
+    def cover(self, feet: Float, range_m: float) -> None:
+        """Grow until the surroundings of `(3,)` feet lie in the grid."""
+        far = min(range_m, _FARTHEST_M)
+        least, most = feet - np.array([far, _BELOW_M, far]), feet + np.array([far, _ABOVE_M, far])
+        lacking = np.stack([self.corner - least, most - self.corner - np.array(self.state.shape) * VOXEL_M], axis=1)
+        further = np.ceil(np.maximum(lacking, 0) / VOXEL_M / _GROWTH).astype(int) * _GROWTH
+        if further.any():
+            self.state = np.pad(self.state, further)
+            self.corner = self.corner - further[:, 0] * VOXEL_M
 
     def integrate(self, depth: Float, pose: Float, camera: Intrinsics, max_range_m: float) -> None:
         """Enter a depth image: `(height, width)` planar metres, 0 where nothing was hit; `(4, 4)` habitat pose.
@@ -74,7 +84,7 @@ class OccupancyGrid:
 
 
 @njit(cache=True)
-def _first_border(at, direction):
+def _axis(at, direction):
     """Along one axis: the step from voxel to voxel, the length to the first border, and that between borders."""
     if direction > 0:
         return 1, (np.floor(at) + 1.0 - at) / direction, 1.0 / direction
@@ -84,37 +94,53 @@ def _first_border(at, direction):
 
 
 @njit(cache=True)
-def _carve(state, eye, ends):
-    """Free what lies between an eye `(3,)` and `(n, 3)` ends, in voxels, up to half a voxel before them.
+def _begin(eye, direction):
+    """The voxel of an eye `(3,)`, in voxels, and the steps, borders and widths of `_axis` along a direction."""
+    a, b, c = _axis(eye[0], direction[0]), _axis(eye[1], direction[1]), _axis(eye[2], direction[2])
+    voxel = int(np.floor(eye[0])), int(np.floor(eye[1])), int(np.floor(eye[2]))
+    return voxel, (a[0], b[0], c[0]), (a[1], b[1], c[1]), (a[2], b[2], c[2])
+
+
+@njit(cache=True)
+def _beyond(voxel, step, border, width):
+    """The next voxel of a ray, its next borders, and the length at which it begins.
 
     From border to border (Amanatides and Woo, 1987, "A fast voxel traversal algorithm for ray tracing").
     """
+    (x, y, z), (a, b, c) = voxel, border
+    if a <= b and a <= c:
+        return (x + step[0], y, z), (a + width[0], b, c), a
+    if b <= c:
+        return (x, y + step[1], z), (a, b + width[1], c), b
+    return (x, y, z + step[2]), (a, b, c + width[2]), c
+
+
+@njit(cache=True)
+def _inside(state, voxel):
+    x, y, z = voxel
+    return 0 <= x < state.shape[0] and 0 <= y < state.shape[1] and 0 <= z < state.shape[2]
+
+
+@njit(cache=True)
+def _carve(state, eye, ends):
+    """Free what lies between an eye `(3,)` and `(n, 3)` ends, in voxels, up to half a voxel before them."""
     for k in range(len(ends)):
-        x, y, z = int(np.floor(eye[0])), int(np.floor(eye[1])), int(np.floor(eye[2]))
-        dx, dy, dz = ends[k, 0] - eye[0], ends[k, 1] - eye[1], ends[k, 2] - eye[2]
-        last = 1.0 - 0.5 / max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-9)
-        step_x, next_x, width_x = _first_border(eye[0], dx)
-        step_y, next_y, width_y = _first_border(eye[1], dy)
-        step_z, next_z, width_z = _first_border(eye[2], dz)
+        way = ends[k] - eye
+        last = 1.0 - 0.5 / max(np.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2]), 1e-9)
+        voxel, step, border, width = _begin(eye, way)
         share = 0.0
-        while share <= last:
-            inside = 0 <= x < state.shape[0] and 0 <= y < state.shape[1] and 0 <= z < state.shape[2]
-            if inside and state[x, y, z] == UNKNOWN:
-                state[x, y, z] = FREE
-            if next_x <= next_y and next_x <= next_z:
-                share, x, next_x = next_x, x + step_x, next_x + width_x
-            elif next_y <= next_z:
-                share, y, next_y = next_y, y + step_y, next_y + width_y
-            else:
-                share, z, next_z = next_z, z + step_z, next_z + width_z
+        while share <= last and _inside(state, voxel):
+            if state[voxel] == UNKNOWN:
+                state[voxel] = FREE
+            voxel, border, share = _beyond(voxel, step, border, width)
 
 
 @njit(cache=True)
 def _occupy(state, hits):
     for k in range(len(hits)):
-        x, y, z = int(np.floor(hits[k, 0])), int(np.floor(hits[k, 1])), int(np.floor(hits[k, 2]))
-        if 0 <= x < state.shape[0] and 0 <= y < state.shape[1] and 0 <= z < state.shape[2]:
-            state[x, y, z] = OCCUPIED
+        voxel = int(np.floor(hits[k, 0])), int(np.floor(hits[k, 1])), int(np.floor(hits[k, 2]))
+        if _inside(state, voxel):
+            state[voxel] = OCCUPIED
 
 
 @njit(cache=True)
@@ -126,27 +152,15 @@ def _gains(state, eyes, directions, reach, rear_side, found):
 
 @njit(cache=True)
 def _gain(state, eye, direction, reach, rear_side):
-    x, y, z = int(np.floor(eye[0])), int(np.floor(eye[1])), int(np.floor(eye[2]))
-    step_x, next_x, width_x = _first_border(eye[0], direction[0])
-    step_y, next_y, width_y = _first_border(eye[1], direction[1])
-    step_z, next_z, width_z = _first_border(eye[2], direction[2])
+    voxel, step, border, width = _begin(eye, direction)
     length, gain, clear, before = 0.0, 0.0, 1.0, FREE
-    while length <= reach and clear > 0.01:
-        if not (0 <= x < state.shape[0] and 0 <= y < state.shape[1] and 0 <= z < state.shape[2]):
-            break
-        now = state[x, y, z]
+    while length <= reach and clear > 0.01 and _inside(state, voxel):
+        now = state[voxel]
         if now == OCCUPIED:
-            if before == UNKNOWN:
-                gain += clear * rear_side
-            break
+            return gain + (clear * rear_side if before == UNKNOWN else 0.0)
         if now == UNKNOWN:
             gain += clear
             clear *= _CLEAR
         before = now
-        if next_x <= next_y and next_x <= next_z:
-            length, x, next_x = next_x, x + step_x, next_x + width_x
-        elif next_y <= next_z:
-            length, y, next_y = next_y, y + step_y, next_y + width_y
-        else:
-            length, z, next_z = next_z, z + step_z, next_z + width_z
+        voxel, border, length = _beyond(voxel, step, border, width)
     return gain

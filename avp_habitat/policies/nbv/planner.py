@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from avp_habitat.policies.frontier import farthest_straight, route_to, shortest_walks
 from avp_habitat.policies.nbv.grid import FREE, OCCUPIED, VOXEL_M, OccupancyGrid
 from avp_habitat.policies.planning import PlanningPolicy
-from avp_habitat.poses import Intrinsics, wrap_angle
+from avp_habitat.poses import Intrinsics, heading, wrap_angle
 from avp_habitat.task.agent_view import AgentView
 from avp_habitat.task.settings import LOOK_DOWN, LOOK_UP, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT
 
@@ -45,8 +45,8 @@ _HEAD_M, _STEP_M = 1.5, 0.2
 class _Candidates:
     """k reachable places, each with views in the directions that turns and tilts can reach."""
 
-    cells: NDArray[np.int64]
-    """`(k, 2)` of the grid, along z and x."""
+    places: Float
+    """`(k, 2)` z and x, metres."""
     aims: list[Float | None]
     """Where to walk straight to on the way, in cells; None at the place where the agent is."""
     first: NDArray[np.floating]
@@ -68,24 +68,23 @@ class NextBestViewPlanner:
         """Know nothing yet."""
         self._grid: OccupancyGrid | None = None
         self._blocked: list[Float] = []
-        # Along z and x from the grid's corner in metres, yaw and pitch in radians: of the goal, and of all views taken.
+        # z and x in metres, yaw and pitch in radians: of the goal, and of all views taken.
         self._goal: Float | None = None
         self._taken = np.zeros((0, 4))
 
     def act(self, view: AgentView) -> int:
         """The next action."""
-        grid = self._grid = self._grid or OccupancyGrid(view.position)
         settings, pose = view.settings, view.camera_to_world
+        grid = self._grid = self._grid or OccupancyGrid(view.position, settings.max_range_m)
+        grid.cover(view.position, settings.max_range_m)
         height = max(1, round(_DEPTH_WIDTH * settings.height / settings.width))
         camera = Intrinsics.from_hfov(_DEPTH_WIDTH, height, hfov_deg=settings.hfov_deg)
         depth = view.simulator.render(pose[None], camera, rgb=False).depth[0]
         grid.integrate(depth, pose, camera, settings.max_range_m)
         if view.collided:
-            ahead = np.array([-np.sin(view.yaw), 0.0, -np.cos(view.yaw)])
-            self._blocked.append(view.position + ahead * (_BODY_M + VOXEL_M))
-        here = (view.position - grid.corner)[[2, 0]]
-        self._taken = np.concatenate([self._taken, [[*here, view.yaw, view.pitch]]])
-        found = self._candidates(view, grid, here / VOXEL_M)
+            self._blocked.append(view.position + heading(np.array(view.yaw)) * (_BODY_M + VOXEL_M))
+        self._taken = np.concatenate([self._taken, [[*view.position[[2, 0]], view.yaw, view.pitch]]])
+        found = self._candidates(view, grid)
         gain = _gains(grid, found, view)
         worth = np.where((gain >= _LEAST_GAIN) & ~_alike(found, self._taken), gain / found.actions, 0.0)
         if self._goal is not None:
@@ -95,7 +94,7 @@ class NextBestViewPlanner:
             self._goal = None
             return TURN_LEFT
         place, yaw, pitch = (int(index) for index in best)
-        self._goal = np.array([*(found.cells[place] + 0.5) * VOXEL_M, found.yaws[yaw], found.pitches[pitch]])
+        self._goal = np.array([*found.places[place], found.yaws[yaw], found.pitches[pitch]])
         return self._action(view, found, place, float(found.yaws[yaw]), float(found.pitches[pitch]))
 
     @staticmethod
@@ -109,9 +108,10 @@ class NextBestViewPlanner:
             return LOOK_UP if pitch > view.pitch else LOOK_DOWN
         return TURN_LEFT if wrap_angle(np.array(yaw - view.yaw)) >= 0 else TURN_RIGHT
 
-    def _candidates(self, view: AgentView, grid: OccupancyGrid, at: Float) -> _Candidates:
-        """The nearest reachable places a spacing apart, by walk, the agent's own, at `(2,)` cells, first."""
+    def _candidates(self, view: AgentView, grid: OccupancyGrid) -> _Candidates:
+        """The nearest reachable places a spacing apart, by walk, the agent's own first."""
         settings, passable = view.settings, self._passable(view, grid)
+        at = (view.position - grid.corner)[[2, 0]] / VOXEL_M
         length, before = shortest_walks(passable, *map(int, at))
         every = round(SPACING_M / VOXEL_M)
         row, column = (int(cell) % every for cell in at)
@@ -127,7 +127,8 @@ class NextBestViewPlanner:
         moves = length[tuple(cells.T)] * VOXEL_M / settings.forward_m
         actions = moves[:, None, None] + turns[:, :, None] / turn + tilts
         apart = max(turn, 2 * np.pi / RAYS) / 2, max(tilt, np.radians(PITCH_STEP_DEG)) / 2
-        return _Candidates(cells, aims, first, yaws, pitches, apart, np.maximum(actions, 1.0))
+        places = (cells + 0.5) * VOXEL_M + grid.corner[[2, 0]]
+        return _Candidates(places, aims, first, yaws, pitches, apart, np.maximum(actions, 1.0))
 
     def _passable(self, view: AgentView, grid: OccupancyGrid) -> NDArray[np.bool_]:
         """`(z, x)` columns of the grid that the agent's body can be in, as far as known."""
@@ -174,7 +175,7 @@ def _aim(passable: NDArray[np.bool_], before: NDArray[np.int64], at: Float, cell
 
 def _alike(found: _Candidates, views: Float) -> NDArray[np.bool_]:
     """`(k, y, p)` whether candidates are like any of `(t, 4)` views: they will not show more."""
-    places = np.linalg.norm((found.cells + 0.5) * VOXEL_M - views[:, None, :2], axis=-1) < SPACING_M / 2
+    places = np.linalg.norm(found.places - views[:, None, :2], axis=-1) < SPACING_M / 2
     yaws = np.abs(wrap_angle(found.yaws - views[:, 2:3])) < found.apart[0]
     pitches = np.abs(found.pitches - views[:, 3:]) < found.apart[1]
     return np.einsum("tk,ty,tp->kyp", places, yaws, pitches, dtype=np.int64) > 0
@@ -182,17 +183,15 @@ def _alike(found: _Candidates, views: Float) -> NDArray[np.bool_]:
 
 def _gains(grid: OccupancyGrid, found: _Candidates, view: AgentView) -> Float:
     """`(k, y, p)` information gain of candidates, in voxels for each of a view's rays."""
-    settings, cells = view.settings, found.cells
-    eyes = np.zeros((len(cells), 3))
-    eyes[:, [2, 0]] = (cells + 0.5) * VOXEL_M + grid.corner[[2, 0]]
+    settings = view.settings
+    eyes = np.zeros((len(found.places), 3))
+    eyes[:, [2, 0]] = found.places
     eyes[:, 1] = view.position[1] + settings.sensor_height_m
     elevations = np.radians(ELEVATIONS_DEG)
     around = view.yaw + np.arange(RAYS) * 2 * np.pi / RAYS
     yaw, elevation = (each.ravel() for each in np.meshgrid(around, elevations, indexing="ij"))
-    directions = np.stack(
-        [-np.sin(yaw) * np.cos(elevation), np.sin(elevation), -np.cos(yaw) * np.cos(elevation)], axis=1
-    )
-    rays = grid.gains(eyes, directions, settings.max_range_m, REAR_SIDE).reshape(len(cells), RAYS, len(elevations))
+    directions = heading(yaw, elevation)
+    rays = grid.gains(eyes, directions, settings.max_range_m, REAR_SIDE).reshape(len(eyes), RAYS, len(elevations))
     camera, solid = settings.intrinsics, np.cos(elevations)
     half_yaw = max(np.arctan(camera.width / 2 / camera.fx), np.pi / RAYS)
     half_pitch = max(np.arctan(camera.height / 2 / camera.fy), np.radians(5.0))

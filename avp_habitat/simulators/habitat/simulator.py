@@ -19,7 +19,7 @@ from avp_habitat.navigation.settings import NavigationSettings
 from avp_habitat.poses import Intrinsics, camera_to_world
 from avp_habitat.scenes.loader import identify, load_located
 from avp_habitat.scenes.location import Frame, SceneLocation, locate
-from avp_habitat.scenes.mesh import TexturedMesh, without_holes
+from avp_habitat.scenes.mesh import TexturedMesh
 from avp_habitat.sight.rules import visible_in_depth
 from avp_habitat.simulators.base import Frames
 from avp_habitat.simulators.habitat.engine import HabitatEngine, OverheadCamera
@@ -92,7 +92,6 @@ def _below_in_tile(engine: HabitatEngine, points: Float, corner: Float) -> NDArr
 _FOCAL_PX, _MOST_PX = 320.0, 1280
 """Points are looked for in images of about this focal length, that of 640x480 pixels at 90°, unless that is larger."""
 _CAMERAS_PER_CALL = 32
-_HOLE_M = 0.02
 
 
 class HabitatSimulator:
@@ -160,8 +159,7 @@ class HabitatSimulator:
 
     def surface_mesh(self) -> TexturedMesh:
         """All surfaces, as the suite reads them; see `simulators.base.Meshed.surface_mesh`."""
-        mesh = load_located(self._location, origin=self.scene_frame.origin).mesh
-        return without_holes(mesh, _HOLE_M)
+        return load_located(self._location, origin=self.scene_frame.origin).mesh
 
     def visible(
         self,
