@@ -193,7 +193,8 @@ def test_a_rollout_says_what_its_depth_is_worth(rollout, capsys):
     kept = json.loads((rollout / "rollout.json").read_text())["metrics"]
     assert command.run(geometry.main, [str(rollout), "--scene", "builtin:3", "--json"]) == 0
     (report,) = json.loads(capsys.readouterr().out)
-    assert {name: report[name] for name in GEOMETRY} == {name: kept[name] for name in GEOMETRY}
+    # Not to the last digit: Open3D builds its trees with several threads.
+    assert [report[name] for name in GEOMETRY] == pytest.approx([kept[name] for name in GEOMETRY], rel=1e-6)
     assert (report["views"], report["policy"]) == (12, "heuristic")
     assert 0.1 < report["completion_ratio"] < report["precision"]
     assert command.run(geometry.main, [str(rollout), "--scene", "builtin:3"]) == 0
@@ -221,7 +222,7 @@ def test_what_the_task_was_is_read_from_the_rollout_itself(tmp_path, capsys):
     kept = collect.collect(options, settings=settings)
     assert command.run(geometry.main, [str(folder), "--scene", "builtin:3", "--json"]) == 0
     (report,) = json.loads(capsys.readouterr().out)
-    assert [report[name] for name in GEOMETRY] == [kept[name] for name in GEOMETRY]
+    assert [report[name] for name in GEOMETRY] == pytest.approx([kept[name] for name in GEOMETRY], rel=1e-6)
     shown = json.loads((folder / "rollout.json").read_text())
     (folder / "rollout.json").write_text(json.dumps(shown | {"scene": "builtin:3"}))
     assert command.run(geometry.main, [str(folder), "--scene", "builtin:3"]) == 1
