@@ -25,7 +25,7 @@ PRESET = PRESETS["demo"]
 class Demo:
     """The whole chain on one room that the policy of the suite has never seen: capture, train, reconstruct, compare.
 
-    Takes about ten minutes on two CPU cores.
+    Takes about five minutes on two CPU cores.
     """
 
     scene: str = "builtin:0"

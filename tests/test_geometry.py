@@ -193,8 +193,8 @@ def test_a_rollout_says_what_its_depth_is_worth(rollout, capsys):
     kept = json.loads((rollout / "rollout.json").read_text())["metrics"]
     assert command.run(geometry.main, [str(rollout), "--scene", "builtin:3", "--json"]) == 0
     (report,) = json.loads(capsys.readouterr().out)
-    # Not to the last digit: Open3D builds its trees with several threads.
-    assert [report[name] for name in GEOMETRY] == pytest.approx([kept[name] for name in GEOMETRY], rel=1e-6)
+    # Not to the last digit: Open3D finds vertices with several threads, and sums in any order.
+    assert [report[name] for name in GEOMETRY] == pytest.approx([kept[name] for name in GEOMETRY], rel=1e-3)
     assert (report["views"], report["policy"]) == (12, "heuristic")
     assert 0.1 < report["completion_ratio"] < report["precision"]
     assert command.run(geometry.main, [str(rollout), "--scene", "builtin:3"]) == 0
@@ -207,6 +207,7 @@ def test_a_rollout_says_what_its_depth_is_worth(rollout, capsys):
         ("ROLLOUT", "builtin:4", "expected a rollout of builtin:4, found one of builtin:3 of another digest"),
         ("missing.ply", "builtin:3", "missing.ply"),
         ("missing", "builtin:3", "missing: expected a rollout folder"),
+        ("runs/config.yml", "builtin:3", "is a reconstruction; measure it by `python -m avp_nerfstudio.geometry`"),
     ],
 )
 def test_what_cannot_be_scored_is_one_line(rollout, capsys, shape, scene, words):
@@ -222,7 +223,7 @@ def test_what_the_task_was_is_read_from_the_rollout_itself(tmp_path, capsys):
     kept = collect.collect(options, settings=settings)
     assert command.run(geometry.main, [str(folder), "--scene", "builtin:3", "--json"]) == 0
     (report,) = json.loads(capsys.readouterr().out)
-    assert [report[name] for name in GEOMETRY] == pytest.approx([kept[name] for name in GEOMETRY], rel=1e-6)
+    assert [report[name] for name in GEOMETRY] == pytest.approx([kept[name] for name in GEOMETRY], rel=1e-3)
     shown = json.loads((folder / "rollout.json").read_text())
     (folder / "rollout.json").write_text(json.dumps(shown | {"scene": "builtin:3"}))
     assert command.run(geometry.main, [str(folder), "--scene", "builtin:3"]) == 1

@@ -54,7 +54,7 @@ def report_on(path: Path, simulator: Simulator, settings: TaskSettings) -> dict[
     """The figures of a rollout folder or a mesh, with what it is; the settings are those of meshes.
 
     Raises:
-        RolloutError: the rollout is damaged, of another scene, or shows no surface.
+        RolloutError: the rollout is damaged, of another scene, shows no surface, or is none but a reconstruction.
         SceneError: the mesh is missing, damaged, empty, or plainly in another frame than the scene.
     """
     from avp_habitat.geometry.scores import rollout_figures
@@ -62,6 +62,8 @@ def report_on(path: Path, simulator: Simulator, settings: TaskSettings) -> dict[
 
     if path.suffix.lower() in _MESHES and not path.is_dir():
         return {"shape": str(path), "scene": simulator.scene, **_of_mesh(path, simulator, settings)}
+    if path.suffix == ".yml" or (path / "scores.json").is_file():
+        raise RolloutError(f"{path}: is a reconstruction; measure it by `python -m avp_nerfstudio.geometry`")
     rollout = read_rollout(path)
     expect_scene(rollout, simulator)
     figures = rollout_figures(rollout, scene_truth(simulator, task_of(rollout)))
