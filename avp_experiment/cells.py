@@ -76,8 +76,7 @@ def plan(configuration: Configuration, root: Path, *, tracking: str) -> list[Cel
             for scene in configuration.scenes:
                 for start in range(configuration.preset.starts):
                     rollout = planner.rollout(method, seed, scene, start, training)
-                    prefixes = (None, *configuration.preset.prefixes)
-                    cells += [rollout, *(planner.reconstruction(rollout, frames) for frames in prefixes)]
+                    cells += [rollout, *planner.reconstructions(rollout)]
     # Trainings first, then what is whole: an experiment that is interrupted late lacks only curves.
     return sorted(cells, key=lambda cell: (list(_MADE).index(cell.kind), cell.frames is not None))
 
@@ -109,25 +108,37 @@ class _Planner:
 
     def rollout(self, method: Method, seed: int, scene: ExperimentScene, start: int, training: Cell | None) -> Cell:
         preset, (width, height) = self.configuration.preset, self.configuration.preset.size
+        after = [str(preset.scaled(views, scene.budget)) for views in preset.geometry_after]
         policy = (str(training.output(self.root)),) if training else (method.spec,)
         policy += ("--stochastic",) if training and not needs_parallax(find_reward(method.reward)) else ()
         name = f"{method.name}-{scene_slug(scene.name)}-{seed}-{start}"
         words = ["python", "-m", "avp_habitat.collect", "--scene", scene.spec, "--policy", *policy]
         words += ["--reward", method.reward]
         # Every method starts at the same places.
-        words += ["--seed", str(_START_SEEDS * (1 + start) + seed), "--budget", str(preset.budget)]
+        words += ["--seed", str(_START_SEEDS * (1 + start) + seed), "--budget", str(scene.budget)]
         words += ["--width", str(width), "--height", str(height), *self.configuration.simulator_options]
         words += ["--metrics", *self.configuration.metrics] if self.configuration.metrics else []
-        words += ["--geometry", "--out", self._out(COLLECT, name), "--mlflow", "off"]
+        words += ["--geometry", *(["--geometry-after", *after] if after else [])]
+        words += ["--out", self._out(COLLECT, name), "--mlflow", "off"]
         return Cell(COLLECT, name, tuple(words), method, seed, scene, start, needs=training)
 
-    def reconstruction(self, rollout: Cell, frames: int | None) -> Cell:
+    def reconstructions(self, rollout: Cell) -> list[Cell]:
+        preset, scene = self.configuration.preset, rollout.scene
+        if preset.reconstructed is not None and (rollout.seed >= preset.reconstructed or rollout.start):
+            return []
+        assert scene is not None
+        prefixes = [preset.scaled(frames, scene.budget) for frames in preset.prefixes]
+        return [self._reconstruction(rollout, scene, frames) for frames in (None, *prefixes)]
+
+    def _reconstruction(self, rollout: Cell, scene: ExperimentScene, frames: int | None) -> Cell:
         preset, of = self.configuration.preset, rollout
         name = of.name if frames is None else f"{of.name}-first_{frames}"
         words = ["python", "-m", "avp_nerfstudio.reconstruct", str(of.output(self.root))]
         words += ["--out", self._out(RECONSTRUCT, name), "--method", preset.reconstruction]
         words += ["--iterations", str(preset.iterations)]
         words += ["--frames", str(frames)] if frames is not None else []
+        if preset.model_geometry:
+            words += ["--scene", scene.spec, *self.configuration.simulator_options]
         if frames is None and of.seed == 0 and of.start == 0:
             words += ["--pictures", *map(str, preset.heldout_pictures)]
         return Cell(RECONSTRUCT, name, tuple(words), of.method, of.seed, of.scene, of.start, frames, of)
@@ -160,7 +171,7 @@ def _of_training(path: Path) -> dict[str, Any]:
 
 
 def _of_rollout(folder: Path) -> dict[str, Any]:
-    """The episode's figures, and coverage and visibility after each view."""
+    """The episode's figures, and what was seen after each view; geometry after some."""
     from avp_habitat.rollout.format import read_rollout
     from avp_habitat.rollout.seen import visibility_of
 
@@ -170,6 +181,8 @@ def _of_rollout(folder: Path) -> dict[str, Any]:
         "metrics": rollout.meta["metrics"] | seen.figures(),
         "coverage_curve": [round(float(row["coverage"]), 6) for row in _steps(folder)],
         "visibility_curve": [round(float(share), 6) for share in seen.curve()],
+        "parallax_curve": [round(float(share), 6) for share in seen.curve(parallax=True)],
+        "geometry_after": rollout.meta.get("geometry_after", {}),
     }
 
 

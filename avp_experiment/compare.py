@@ -5,7 +5,7 @@ import shlex
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from tyro.conf import arg
 
 from avp_experiment.cells import plan
-from avp_experiment.configuration import DEFAULT, PRESETS, ROOMS, Configuration, chosen_methods, read_scenes
+from avp_experiment.configuration import DEFAULT, PRESETS, ROOMS, Configuration, Method, chosen_methods, read_scenes
 from avp_experiment.folder import open_folder
 from avp_experiment.runner import PRELOAD, Runner, environment
 from avp_habitat import command
@@ -43,10 +43,11 @@ class Compare:
     Writes tables, figures and the answers to the paper's questions. What is done is not done again.
     """
 
-    scene: str = "builtin:0"
-    """Scenes to train in, with commas between."""
-    unseen: str = "builtin:1"
-    """Scenes never trained in, with commas between, or none."""
+    scene: str = AUTO
+    """Scenes to train in, with commas between; auto: builtin:0, of benchmarks none."""
+    unseen: str = AUTO
+    """Scenes never trained in, with commas between, or none; auto: builtin:1, of benchmarks their own, to which those
+    named here come."""
     preset: Annotated[str, arg(help=", ".join(PRESETS))] = "cpu"
     seeds: str = AUTO
     """Trainings of each reward; auto: the preset's number."""
@@ -65,15 +66,19 @@ class Compare:
         """Everything that can be known to be wrong is refused here, before anything is written."""
         if self.preset not in PRESETS:
             raise unknown_name("preset", self.preset, PRESETS)
-        methods = chosen_methods(DEFAULT if self.methods == AUTO else _split(self.methods))
         preset = PRESETS[self.preset]
+        methods = chosen_methods(preset.methods if self.methods == AUTO else _split(self.methods))
         seeds, starts = _number("seeds", self.seeds, preset.seeds), _number("starts", self.starts, preset.starts)
+        if preset.benchmark:
+            _hold_benchmark(self.preset, methods, seeds)
         preset = replace(preset, seeds=seeds, starts=starts)
         choice = SimulatorChoice(self.simulator, up=self.up)
         metrics = _split(self.metrics)
         find_metrics(metrics)
-        scenes = read_scenes(_split(self.scene), _split(self.unseen), choice)
-        return Configuration(self.preset, preset, scenes, methods, tuple(metrics), self.simulator, self.up)
+        train, unseen = ("", "") if preset.benchmark else ("builtin:0", "builtin:1")
+        train, unseen = (auto if said == AUTO else said for said, auto in ((self.scene, train), (self.unseen, unseen)))
+        found = read_scenes(_split(train), _split(unseen), choice, preset)
+        return Configuration(self.preset, preset, found, methods, tuple(metrics), self.simulator, self.up)
 
     @property
     def line(self) -> str:
@@ -84,6 +89,17 @@ class Compare:
             return " ".join(["mlflow run . -e compare --env-manager local", *options])
         options = [word for name, value in chosen.items() for word in (f"--{name}", value)]
         return shlex.join(["python", "-m", "avp_experiment.compare", *options])
+
+
+def _hold_benchmark(name: str, methods: Sequence[Method], seeds: int) -> None:
+    if seeds != PRESETS[name].seeds:
+        raise UsageError(f"seeds: {name} has {PRESETS[name].seeds}, got {seeds}; more starts are welcome")
+    for method in methods:
+        if method.learned and not method.in_rooms:
+            raise UsageError(
+                f"methods: nothing is trained in the scenes of {name}, as {method.name} would be; expected a policy or "
+                f"REWARD{ROOMS}, which is trained in generated rooms"
+            )
 
 
 def _split(text: str) -> list[str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from avp_habitat import plugins
-from avp_habitat.errors import UsageError, unknown_name
+from avp_habitat.errors import SceneError, UsageError, unknown_name
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.task.rewards import REWARDS
 
@@ -57,6 +57,8 @@ def known_methods() -> dict[str, Method]:
     return {method.name: method for method in methods}
 
 
+_IN_ROOMS = tuple(f"{name}{ROOMS}" for name in ("coverage", "coverage_redundancy", "proposed", "surface", "multiview"))
+"""The suite's rewards, named one by one: a benchmark does not change when a reward is added."""
 BASELINES = ("heuristic", "random", "frontier", "greedy", "nbv", "oracle", "survey")
 """What learned policies are compared with by default; the last two plan with full knowledge."""
 DEFAULT = (*BASELINES, *REWARDS, f"proposed{ROOMS}", f"surface{ROOMS}", "pretrained")
@@ -92,6 +94,16 @@ def chosen_methods(names: Sequence[str]) -> tuple[Method, ...]:
 
 
 @dataclass(frozen=True)
+class FixedScene:
+    """A scene that belongs to a preset, and must be the same for everybody."""
+
+    spec: str
+    sha256: str
+    budget: int
+    """T there: most views of an episode."""
+
+
+@dataclass(frozen=True)
 class ExperimentPreset:
     """Everything about an experiment but its scenes, methods and simulator."""
 
@@ -117,6 +129,22 @@ class ExperimentPreset:
     """T: most views of an episode."""
     heldout_pictures: tuple[int, ...] = (3, 11, 16)
     """Held-out views whose renders are kept."""
+    methods: tuple[str, ...] = DEFAULT
+    """Compared where the user names none."""
+    benchmark: bool = False
+    """Nothing is trained in the scenes, and neither seeds nor scenes of its own can be exchanged."""
+    fixed: tuple[FixedScene, ...] = ()
+    """Scenes of its own; the user's come to them."""
+    geometry_after: tuple[int, ...] = ()
+    """Geometry is also measured of the first so many views."""
+    reconstructed: int | None = None
+    """So many seeds are reconstructed, the first start of each; None: everything."""
+    model_geometry: bool = False
+    """Measure the geometry of reconstructions too."""
+
+    def scaled(self, views: int, budget: int) -> int:
+        """A number of views, stated for the preset's budget, for that of a scene."""
+        return round(views * budget / self.budget)
 
 
 PRESETS = {
@@ -125,9 +153,40 @@ PRESETS = {
     "cpu": ExperimentPreset(700_000, 700_000, size=(192, 144), iterations=300, prefixes=(20, 40)),
     "gpu": ExperimentPreset(1_000_000, 2_000_000, starts=3),
     "paper": ExperimentPreset(300_000, 300_000, observation="numbers", reconstruction="nerfacto"),
+    "benchmark-v1": ExperimentPreset(
+        0,
+        500_000,
+        size=(192, 144),
+        iterations=500,
+        prefixes=(20, 40),
+        methods=("heuristic", "random", "frontier", "greedy", "nbv", "survey", *_IN_ROOMS, "pretrained"),
+        benchmark=True,
+        fixed=(
+            FixedScene("builtin:100000", "ee50d313178757051cc1d6ff790e608a08a3e9286ae3984a278f5835b0ea292b", 80),
+            FixedScene("builtin:100001", "681cffbd90409622ef82962668bccd2da1d55fc81d29e143557b1d417b9abd9d", 80),
+            FixedScene("builtin-home:100000", "3b9143c7e53eb82b53636ce2ad158f46c692b35b6006e7d682e5c01e92f224b5", 196),
+            FixedScene("builtin-home:100001", "2f767ed80be0d3964437f7d8a018706f1c14d0f599a059c9ad1b7f447ea082f9", 173),
+        ),
+        geometry_after=(20, 40, 60),
+        reconstructed=1,
+        model_geometry=True,
+    ),
+    "benchmark-v1-full": ExperimentPreset(
+        0,
+        500_000,
+        seeds=1,
+        iterations=6000,
+        prefixes=(),
+        methods=("heuristic", "greedy", "nbv", "survey", f"proposed{ROOMS}", f"surface{ROOMS}", "pretrained"),
+        benchmark=True,
+        geometry_after=(20, 40, 60),
+        model_geometry=True,
+    ),
 }
 """demo: one short training, no curves (`make demo`). smoke: minutes, to see that everything works. cpu: two to three
-hours on two cores. gpu: the same questions at full size. paper: the paper's observation, steps and reconstruction."""
+hours on two cores. gpu: the same questions at full size. paper: the paper's observation, steps and reconstruction.
+benchmark-v1: what docs/benchmark.md says; a change of any of its values is a new version. benchmark-v1-full: its
+reconstructions at full size, ten minutes of a core each."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +198,8 @@ class ExperimentScene:
     sha256: str
     role: str
     """`TRAIN` or `UNSEEN`."""
+    budget: int = 80
+    """T there: most views of an episode."""
 
 
 def scene_slug(name: str) -> str:
@@ -176,29 +237,57 @@ class Configuration:
 
     def as_json(self) -> dict[str, Any]:
         """Scenes, preset and its values as the results state them."""
-        values = asdict(self.preset)
+        preset, scenes = self.preset, []
+        values = asdict(preset)
+        for name in ("methods", "fixed"):
+            del values[name]
+        # Experiments of before know none of these.
+        for name in ("benchmark", "geometry_after", "reconstructed", "model_geometry"):
+            if values[name] == getattr(ExperimentPreset, name):
+                del values[name]
         width, height = values.pop("size")
-        values |= {name: list(values[name]) for name in ("prefixes", "heldout_pictures")}
+        values = {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
         values |= {"rooms": list(self.rooms), "width": width, "height": height}
         values |= {"metrics": list(self.metrics)} if self.metrics else {}
-        scenes = [{"name": scene.name, "sha256": scene.sha256, "role": scene.role} for scene in self.scenes]
+        for scene in self.scenes:
+            budget = {"budget": scene.budget} if scene.budget != preset.budget else {}
+            scenes.append({"name": scene.name, "sha256": scene.sha256, "role": scene.role, **budget})
         return {"preset": self.preset_name, **values, "simulator": self.simulator, "scenes": scenes}
 
 
-def read_scenes(train: Sequence[str], unseen: Sequence[str], choice: SimulatorChoice) -> tuple[ExperimentScene, ...]:
-    """Open every scene once, so that one that cannot be used is named before anything long begins."""
-    if not train:
-        raise UsageError("scene: expected at least one scene of training, got none")
+def read_scenes(
+    train: Sequence[str], unseen: Sequence[str], choice: SimulatorChoice, preset: ExperimentPreset
+) -> tuple[ExperimentScene, ...]:
+    """Open every scene once, so that one that cannot be used is named before anything long begins.
+
+    Raises:
+        UsageError: no scene where one is needed, or one comes twice.
+        SceneError: one cannot be used, or is not the one that the preset names.
+    """
+    fixed = {scene.spec: scene for scene in preset.fixed}
+    unseen = [*fixed, *(spec for spec in unseen if spec not in fixed)]
+    if preset.benchmark and train:
+        raise UsageError(f"scene: nothing is trained in the scenes of a benchmark; give {', '.join(train)} as unseen")
+    if not (unseen if preset.benchmark else train):
+        raise UsageError(f"{'unseen' if preset.benchmark else 'scene'}: expected at least one scene, got none")
     found: list[ExperimentScene] = []
     for role, specs in ((TRAIN, train), (UNSEEN, unseen)):
         for spec in specs:
-            opened = open_simulator(choice, spec)
-            _ = opened.area
-            scene = ExperimentScene(spec, opened.scene, opened.scene_digest, role)
-            opened.close()
+            scene = _scene(spec, role, choice, preset.budget, fixed.get(spec))
             for other in found:
                 if scene.sha256 == other.sha256 or scene_slug(scene.name) == scene_slug(other.name):
                     same = "the same scene as" if scene.sha256 == other.sha256 else "named as"
                     raise UsageError(f"{spec}: {same} {other.spec}, given as {other.role}; expected each name once")
             found.append(scene)
     return tuple(found)
+
+
+def _scene(spec: str, role: str, choice: SimulatorChoice, budget: int, fixed: FixedScene | None) -> ExperimentScene:
+    opened = open_simulator(choice, spec)
+    _ = opened.area
+    scene = ExperimentScene(spec, opened.scene, opened.scene_digest, role, fixed.budget if fixed else budget)
+    opened.close()
+    if fixed and scene.sha256 != fixed.sha256:
+        wanted = f"expected the digest {fixed.sha256}, which the benchmark is made with"
+        raise SceneError(f"{spec}: {wanted}, found {scene.sha256}: another version makes another scene")
+    return scene

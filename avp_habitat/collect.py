@@ -11,7 +11,7 @@ from tyro.conf import arg
 
 from avp_habitat import command
 from avp_habitat.command import progress
-from avp_habitat.errors import AVPError, RolloutError
+from avp_habitat.errors import AVPError, RolloutError, UsageError
 from avp_habitat.files import check_writable
 from avp_habitat.geometry.truth import scene_truth
 from avp_habitat.metrics import METRICS_HELP
@@ -72,6 +72,8 @@ class Collect:
     """Of the pictures in pixels."""
     geometry: bool = False
     """Also measure how true the fused depth is (accuracy, completion …); takes ten seconds or more."""
+    geometry_after: tuple[int, ...] = ()
+    """With --geometry: also that of the first so many views."""
     stochastic: bool = False
     """Sample a model's actions instead of taking the likeliest."""
     trusted: Annotated[bool, arg(help=TRUSTED)] = False
@@ -85,6 +87,8 @@ class Collect:
     def __post_init__(self) -> None:
         """Hold the ranges."""
         hold_ranges(self)
+        if self.geometry_after and (not self.geometry or min(self.geometry_after) < 1):
+            raise UsageError(f"geometry_after: expected numbers from 1, and --geometry, got {self.geometry_after}")
 
 
 def _settings(options: Collect, area_m2: float | None = None) -> TaskSettings:
@@ -111,7 +115,7 @@ def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: 
     with RolloutWriter(options.out, camera) as writer:
         simulator = open_simulator(options.simulator, options.scene)
         settings = settings or _settings(options, simulator.area.area_m2)
-        geometry = options.geometry and _knows_truth(simulator, settings, camera)
+        measured = options.geometry and _knows_truth(simulator, settings, camera)
         env, policy = make_policy_env(
             options.policy,
             simulator,
@@ -135,7 +139,7 @@ def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: 
             policy={"name": Path(name_of(options.policy)).name, "deterministic": not options.stochastic},
             seed=options.seed,
             heldout=heldout,
-            geometry=geometry,
+            geometry=options.geometry_after if measured else None,
             mlflow_run_id=getattr(policy, "avp_mlflow_run_id", None) or os.environ.get("MLFLOW_RUN_ID"),
         )
 

@@ -66,7 +66,7 @@ def report_on(path: Path, simulator: Simulator, settings: TaskSettings) -> dict[
         raise RolloutError(f"{path}: is a reconstruction; measure it by `python -m avp_nerfstudio.geometry`")
     rollout = read_rollout(path)
     expect_scene(rollout, simulator)
-    figures = rollout_figures(rollout, scene_truth(simulator, task_of(rollout)))
+    figures, _ = rollout_figures(rollout, scene_truth(simulator, task_of(rollout)))
     if not figures:
         raise RolloutError(f"{path}: expected depth pictures that show some surface, found none")
     scene, policy = (name_of(rollout.meta, name) for name in ("scene", "policy"))

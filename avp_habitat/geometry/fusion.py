@@ -16,60 +16,78 @@ TRUNCATION_M = 0.04
 _BLOCK, _BLOCKS, _STRIDE = 8, 20_000, 4
 
 
-def fuse(
-    views: Iterable[tuple[NDArray[np.floating], NDArray[np.floating]]],
-    intrinsics: Intrinsics,
-    *,
-    max_range_m: float,
-    voxel_m: float = VOXEL_M,
-    truncation_m: float = TRUNCATION_M,
-) -> Shape | None:
-    """Fuse depth images, one at a time; 80 of 640x480 pixels take three seconds.
+class Fusion:
+    """Depth images become a surface one at a time; what there is by now can be taken at any time.
 
-    Args:
-        views: `(height, width)` planar depth in metres, 0 where nothing was hit, and `(4, 4)` habitat camera_to_world.
-        intrinsics: of the images.
-        max_range_m: depth beyond this is left out, metres.
-        voxel_m: side of a voxel, metres.
-        truncation_m: see `TRUNCATION_M`.
-
-    Returns:
-        The surface that any of them shows; None where none shows any.
+    80 images of 640x480 pixels take three seconds.
     """
-    import open3d
 
-    core, far = open3d.core, float(max_range_m)
-    one = core.SizeVector([1])
-    voxels = open3d.t.geometry.VoxelBlockGrid(
-        ("tsdf", "weight"), (core.float32, core.float32), (one, one), voxel_m, _BLOCK, _BLOCKS
-    )
+    def __init__(
+        self,
+        intrinsics: Intrinsics,
+        *,
+        max_range_m: float,
+        voxel_m: float = VOXEL_M,
+        truncation_m: float = TRUNCATION_M,
+    ) -> None:
+        """Begin with nothing.
 
-    def camera(by: int) -> Any:
-        """For images enlarged by a factor; Open3D cuts a pixel's coordinates, so it counts from corners as we do."""
-        fx, fy, cx, cy = (by * each for each in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
-        return core.Tensor(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64))
+        Args:
+            intrinsics: of the images.
+            max_range_m: depth beyond this is left out, metres.
+            voxel_m: side of a voxel, metres.
+            truncation_m: see `TRUNCATION_M`.
+        """
+        import open3d
 
-    def image(depth: NDArray[np.float32]) -> Any:
-        return open3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(depth)))
+        core: Any = open3d.core
+        self._core = core
+        self._image, self._intrinsics, self._far = open3d.t.geometry.Image, intrinsics, float(max_range_m)
+        self._multiplier = truncation_m / voxel_m
+        one = core.SizeVector([1])
+        self._voxels = open3d.t.geometry.VoxelBlockGrid(
+            ("tsdf", "weight"), (core.float32, core.float32), (one, one), voxel_m, _BLOCK, _BLOCKS
+        )
 
-    multiplier = truncation_m / voxel_m
-    for depth, pose in views:
-        planar = np.where((depth > 0) & (depth <= far), depth, 0.0).astype(np.float32)
+    def add(self, depth: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
+        """Add a `(height, width)` planar depth in metres, 0 where nothing was hit, of a `(4, 4)` habitat pose."""
+        planar = np.where((depth > 0) & (depth <= self._far), depth, 0.0).astype(np.float32)
         if not planar.any():
-            continue
-        extrinsic = core.Tensor(np.linalg.inv(habitat_to_opencv(np.asarray(pose, np.float64))))
+            return
+        extrinsic = self._core.Tensor(np.linalg.inv(habitat_to_opencv(np.asarray(pose, np.float64))))
         # It looks for the blocks to fill at every fourth pixel only, between which there would be holes.
         larger = planar.repeat(_STRIDE, axis=0).repeat(_STRIDE, axis=1)
-        blocks = voxels.compute_unique_block_coordinates(
-            image(larger), camera(_STRIDE), extrinsic, 1.0, far, multiplier
-        )
-        voxels.integrate(blocks, image(planar), camera(1), extrinsic, 1.0, far, multiplier)
-    if not voxels.hashmap().size():
-        return None
-    # A surface that a single view shows is kept.
-    mesh = voxels.extract_triangle_mesh(weight_threshold=0.5)
-    vertices, triangles = mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy()
-    if not len(triangles):
-        return None
-    # Open3D's threads give them in any order, and samples of the surface depend on it.
-    return Shape(vertices, triangles[np.lexsort(vertices[triangles].sum(axis=1).T)])
+        ending = (extrinsic, 1.0, self._far, self._multiplier)
+        blocks = self._voxels.compute_unique_block_coordinates(self._of(larger), self._camera(_STRIDE), *ending)
+        self._voxels.integrate(blocks, self._of(planar), self._camera(1), *ending)
+
+    def shape(self) -> Shape | None:
+        """The surface that any of the images shows; None where none shows any."""
+        if not self._voxels.hashmap().size():
+            return None
+        # A surface that a single view shows is kept.
+        mesh = self._voxels.extract_triangle_mesh(weight_threshold=0.5)
+        vertices, triangles = mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy()
+        if not len(triangles):
+            return None
+        # Open3D's threads give them in any order, and samples of the surface depend on it.
+        return Shape(vertices, triangles[np.lexsort(vertices[triangles].sum(axis=1).T)])
+
+    def _camera(self, by: int) -> Any:
+        """For images enlarged by a factor; Open3D cuts a pixel's coordinates, so it counts from corners as we do."""
+        of = self._intrinsics
+        fx, fy, cx, cy = (by * each for each in (of.fx, of.fy, of.cx, of.cy))
+        return self._core.Tensor(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64))
+
+    def _of(self, depth: NDArray[np.float32]) -> Any:
+        return self._image(self._core.Tensor(np.ascontiguousarray(depth)))
+
+
+def fuse(
+    views: Iterable[tuple[NDArray[np.floating], NDArray[np.floating]]], intrinsics: Intrinsics, **settings: float
+) -> Shape | None:
+    """The surface that depth images with their poses show, `Fusion` of all of them by its settings."""
+    fusion = Fusion(intrinsics, **settings)
+    for depth, pose in views:
+        fusion.add(depth, pose)
+    return fusion.shape()

@@ -1,11 +1,12 @@
 """The field's figures of geometry, each as it is usually defined, and never the one for the other."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avp_habitat.geometry.fusion import fuse
+from avp_habitat.geometry.fusion import Fusion
 from avp_habitat.geometry.shape import Shape
 from avp_habitat.geometry.truth import CAMERA, SAMPLES, SceneTruth
 from avp_habitat.metrics import NEAR_M
@@ -64,12 +65,29 @@ def _depth_l1(true: NDArray[np.floating], found: NDArray[np.floating]) -> float:
     return float(np.abs(found[shown].astype(np.float64) - true[shown]).mean()) if shown.any() else 0.0
 
 
-def rollout_figures(rollout: Rollout, truth: SceneTruth) -> dict[str, float]:
+def rollout_figures(
+    rollout: Rollout, truth: SceneTruth, after: Sequence[int] = ()
+) -> tuple[dict[str, float], dict[int, dict[str, float]]]:
     """What the depth pictures of a rollout, fused, are worth; nothing where they show no surface.
+
+    Args:
+        rollout: of the scene.
+        truth: of the scene.
+        after: numbers of views; of the first so many the figures are wanted too.
+
+    Returns:
+        The figures of all frames, and by number those of the first so many, where there are more than these.
 
     Raises:
         RolloutError: a depth picture cannot be decoded.
     """
-    views = ((read_depth(view.depth), view.camera_to_world) for view in rollout.frames)
-    shape = fuse(views, rollout.intrinsics, max_range_m=truth.max_range_m)
+    fusion, found = Fusion(rollout.intrinsics, max_range_m=truth.max_range_m), {}
+    for count, view in enumerate(rollout.frames, start=1):
+        fusion.add(read_depth(view.depth), view.camera_to_world)
+        if count in after and count < len(rollout.frames):
+            found[count] = _figures(fusion.shape(), truth)
+    return _figures(fusion.shape(), truth), found
+
+
+def _figures(shape: Shape | None, truth: SceneTruth) -> dict[str, float]:
     return {} if shape is None else score(shape, truth).figures()

@@ -4,7 +4,7 @@ import multiprocessing
 import os
 import sys
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -71,7 +71,7 @@ def publish_rollout(
     seed: int | None,
     heldout: int,
     mlflow_run_id: str | None = None,
-    geometry: bool = False,
+    geometry: Sequence[int] | None = None,
 ) -> dict[str, Any]:
     """Draw the trajectory and the floor, measure what was seen, and publish the folder.
 
@@ -83,7 +83,7 @@ def publish_rollout(
         seed: of the episode's start; None when it was not seeded itself.
         heldout: number of held-out views written.
         mlflow_run_id: of the training that the policy comes from.
-        geometry: whether to measure how true the fused depth is, which takes some seconds.
+        geometry: None, or measure how true the fused depth is, also of the first so many views; takes some seconds.
 
     Returns:
         The metrics of `rollout.json`: those of the episode, where held-out views show a surface `visibility` and
@@ -99,9 +99,12 @@ def publish_rollout(
     # From the files, in whole millimetres, so that the figure is the one that a reader of the folder computes.
     seen = visibility_of(frames, views, writer.intrinsics).figures() if views else {}
     visibility = {name: seen[name] for name in ("visibility", "visibility_parallax") if name in seen}
-    shape = rollout_figures(rollout, scene_truth(env.simulator, task_of(rollout))) if geometry else {}
+    shape, after = {}, {}
+    if geometry is not None:
+        shape, after = rollout_figures(rollout, scene_truth(env.simulator, task_of(rollout)), geometry)
     metrics = info["avp_episode"] | visibility | shape | measured(env.settings.metrics, "rollout", rollout)
     about = {"policy": policy, "seed": seed, "metrics": metrics, "floor": floor, "mlflow_run_id": mlflow_run_id}
+    about |= {"geometry_after": {str(count): figures for count, figures in after.items()}} if after else {}
     writer.publish(rollout.meta | about)
     return metrics
 
