@@ -13,6 +13,8 @@ from avp_habitat.tables import table
 
 PAIRS = (("surface", "proposed"), (f"surface{ROOMS}", f"proposed{ROOMS}"))
 """Compared: the same training, another reward."""
+OURS, OTHERS = "pretrained", ("coverage", f"coverage{ROOMS}", "greedy", "nbv")
+"""Compared: the views that the former needs for what the others have in the end."""
 FEWER_VIEWS, WORSE_DB, GOOD_RHO = 0.25, 0.3, 0.8
 """What the paper's method is held to: at least so many fewer views at no more than so much lower PSNR; and what a
 predictor of PSNR is held to."""
@@ -28,7 +30,8 @@ def claims(results: Results) -> str:
         "Heuristic against learned policies": _heuristic(results),
         "`proposed` against `coverage`: fewer views at equal PSNR": _fewer_views(results),
         "`surface` against `proposed`": _surface_against_proposed(results),
-        "Visibility as a predictor of PSNR": _prediction(results),
+        f"Views that `{OURS}` needs": _views_needed(results),
+        "What predicts PSNR": _prediction(results),
         "Unseen scenes against those of training": _transfer(results),
         "Cells that failed": _failures(results),
     }
@@ -47,7 +50,7 @@ def _failures(results: Results) -> list[str]:
 
 def _heuristic(results: Results) -> list[str]:
     # By the trainings that are there; a training that failed has no episodes to compare.
-    trained = {one.method for one in results.training}
+    trained = {one.method for one in results.training} | {OURS}
     names, lines = ("coverage", "psnr"), []
     for role, where in _WHERE.items():
         found = {}
@@ -78,21 +81,27 @@ def _below(found: Sequence[Sequence[Summary | None]]) -> str:
 
 def _fewer_views(results: Results) -> list[str]:
     lines = []
-    for role, where in _WHERE.items():
-        both = ("proposed", "coverage")
-        views, psnr = ([results.values(method, role, name) for method in both] for name in ("views", "psnr"))
-        saved, difference, where = statistics.saved_share(*views), statistics.paired(*psnr), where.capitalize()
-        if saved is None or difference is None:
-            missing = "episodes" if saved is None else "reconstructions"
-            lines.append(f"{where}: cannot be said, `proposed` and `coverage` have no {missing} in common.")
+    for ending in ("", ROOMS) if f"proposed{ROOMS}" in results.methods else ("",):
+        both = (f"proposed{ending}", f"coverage{ending}")
+        if ending and not set(both) <= set(results.methods):
             continue
-        taken = " against ".join(map(_mean, views))
-        lines.append(
-            f"{where} `proposed` takes {saved.text(COVERAGE)} % fewer views than `coverage` ({taken}); its PSNR "
-            f"differs by {difference.text(PSNR, sign=True)} dB. At least {100 * FEWER_VIEWS:.0f} % fewer views at a "
-            f"PSNR no more than {WORSE_DB} dB lower: {_holds(saved, difference)}"
-        )
+        lines += [_fewer_views_in(results, role, *both) for role in _WHERE if results.scenes(role)]
     return lines
+
+
+def _fewer_views_in(results: Results, role: str, less: str, more: str) -> str:
+    views, psnr = ([results.values(method, role, name) for method in (less, more)] for name in ("views", "psnr"))
+    saved, difference = statistics.saved_share(*views), statistics.paired(*psnr)
+    where = _WHERE[role].capitalize()
+    if saved is None or difference is None:
+        missing = "episodes" if saved is None else "reconstructions"
+        return f"{where}: cannot be said, `{less}` and `{more}` have no {missing} in common."
+    taken = " against ".join(map(_mean, views))
+    return (
+        f"{where} `{less}` takes {saved.text(COVERAGE)} % fewer views than `{more}` ({taken}); its PSNR "
+        f"differs by {difference.text(PSNR, sign=True)} dB. At least {100 * FEWER_VIEWS:.0f} % fewer views at a "
+        f"PSNR no more than {WORSE_DB} dB lower: {_holds(saved, difference)}"
+    )
 
 
 def _holds(saved: Summary, difference: Summary) -> str:
@@ -141,8 +150,8 @@ def _compared(results: Results, left: str, right: str, role: str) -> list[str]:
     return [
         f"{where}, `{left}` against `{right}`: {said}",
         table(head, rows, words=1),
-        _equal_psnr(first, second, left, right),
-        _equal_psnr(second, first, right, left),
+        _equal(first, second, left, right),
+        _equal(second, first, right, left),
     ]
 
 
@@ -168,12 +177,31 @@ def _equal_views(difference: Summary) -> str:
     return f"{shown}: {higher} on average, but the interval holds 0."
 
 
-def _equal_psnr(left: Curves, right: Curves, name: str, other: str) -> str:
-    """How many views the left method needs for the final PSNR of the right one."""
+def _views_needed(results: Results) -> list[str]:
+    lines = []
+    for role, where in _WHERE.items():
+        for other in OTHERS:
+            for figure, curves in (("PSNR", _curves), ("completion ratio", _completion)):
+                ours, theirs = (curves(results, method, role) for method in (OURS, other))
+                common = [key for key in ours if key in theirs]
+                if common:
+                    ours, theirs = ({key: found[key] for key in common} for found in (ours, theirs))
+                    lines.append(f"- {where.capitalize()}: {_equal(ours, theirs, OURS, other, figure)}")
+    return ["\n".join(lines) or f"Nothing to compare: no episodes of `{OURS}` and another method in common."]
+
+
+def _completion(results: Results, method: str, role: str) -> Curves:
+    """Completion ratio of the captured depth by number of views, by episode."""
+    found = [one for one in results.rollouts if (one.method, one.role) == (method, role)]
+    return {one.key: dict(sorted(curve.items())) for one in found if (curve := one.curves.get("completion_ratio"))}
+
+
+def _equal(left: Curves, right: Curves, name: str, other: str, figure: str = "PSNR") -> str:
+    """How many views the left method needs for the final PSNR, or another figure, of the right one."""
     taken = {key: float(max(curve)) for key, curve in right.items()}
     needed = {key: statistics.views_to_reach(curve, right[key][max(right[key])]) for key, curve in left.items()}
     reached = {key: views for key, views in needed.items() if views is not None}
-    head = f"The final PSNR of `{other}` is reached by `{name}`"
+    head = f"The final {figure} of `{other}` is reached by `{name}`"
     if not reached:
         return f"{head} in none of {len(needed)} episodes: never reached."
     if len(reached) < len(needed):
@@ -189,27 +217,33 @@ def _equal_psnr(left: Curves, right: Curves, name: str, other: str) -> str:
 
 def _prediction(results: Results) -> list[str]:
     points = statistics.points_of(results)
-    found = {name: statistics.correlations(points, name) for name in PREDICTORS}
-    seen = found["visibility"]
-    overall, whole = seen["all"], seen["whole episodes"]
-    if overall is None:
+    known = [name for name in PREDICTORS if points and name in points[0].shares]
+    found = {name: statistics.correlations(points, name) for name in known}
+    overall = {name: one["all"] for name, one in found.items() if one["all"]}
+    if not overall:
         return ["Cannot be said: fewer than three reconstructions with a visibility and a PSNR, or all alike."]
-    reached = f"at least {GOOD_RHO}" if overall.rho >= GOOD_RHO else f"below {GOOD_RHO}"
-    also = f"; over whole episodes only {whole}" if whole else ""
-    head, rows = ["Spearman's ρ with PSNR", *PREDICTORS, "reconstructions", "rollouts"], []
-    for where, one in seen.items():
+    best = max(overall, key=lambda name: overall[name].rho)
+    others = ", ".join(f"{FIGURES[name].title} {one}" for name, one in overall.items() if name != best)
+    reached = f"at least {GOOD_RHO}" if overall[best].rho >= GOOD_RHO else f"below {GOOD_RHO}"
+    also = f"; over whole episodes only {whole}" if (whole := found[best]["whole episodes"]) else ""
+    head = ["Spearman's ρ with PSNR", *(FIGURES[name].title for name in known), "reconstructions", "rollouts"]
+    rows = []
+    for where in found[best]:
+        one = found[best][where]
         counts = [str(one.points), str(one.rollouts)] if one else [NOTHING, NOTHING]
-        rows.append([where, *(str(found[name][where] or NOTHING) for name in PREDICTORS), *counts])
+        rows.append([where, *(str(found[name].get(where) or NOTHING) for name in known), *counts])
     return [
-        f"Over all reconstructions visibility and PSNR have {overall}, {reached}{also}. In brackets: 95 % "
-        "interval, bootstrap over rollouts.",
+        f"Over all reconstructions {FIGURES[best].title} predicts PSNR best: {overall[best]}, {reached}{also}"
+        + (f"; {others}" if others else "")
+        + ". In brackets: 95 % interval, bootstrap over rollouts.",
         table(head, rows, words=1),
     ]
 
 
 def _transfer(results: Results) -> list[str]:
-    if not results.scenes(UNSEEN):
-        return ["No unseen scene in this experiment."]
+    for role, name in ((UNSEEN, "unseen scene"), (TRAIN, "scene of training")):
+        if not results.scenes(role):
+            return [f"No {name} in this experiment."]
     names = ("views", "coverage", "psnr")
     head, rows = ["unseen − train", *map(_heading, names)], []
     for method in results.methods:

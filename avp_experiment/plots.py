@@ -129,7 +129,7 @@ def psnr_by_views(results: Results) -> Drawn:
         axes.set(xlabel="views (frames used)", ylabel="PSNR on held-out views [dB]")
         axes.set_title(f"{_ROLES[role]}: {', '.join(results.scenes(role))}", fontsize=10)
         axes.grid(alpha=0.3)
-    _legend(picture, panels)
+    legend(picture, panels)
     return Drawn(
         picture,
         "PSNR of reconstructions from the first k frames of an episode; the last point of a line is the whole episode, "
@@ -139,30 +139,35 @@ def psnr_by_views(results: Results) -> Drawn:
     )
 
 
-def visibility_and_psnr(results: Results) -> Drawn:
-    """Visibility against PSNR of all reconstructions, beside coverage against PSNR."""
+def predictors_and_psnr(results: Results) -> Drawn:
+    """What may predict PSNR against the PSNR of all reconstructions."""
     points = points_of(results)
     if not points:
         raise Missing("no reconstruction has both a visibility and a PSNR")
-    picture = new_figure(5.4)
-    panels = picture.subplots(1, 2, sharey=True)
-    for axes, name in zip(panels, PREDICTORS, strict=True):
+    known = [name for name in PREDICTORS if name in points[0].shares]
+    rows = -(-len(known) // 2)
+    picture = new_figure(0.9 + 4.5 * rows)
+    panels = picture.subplots(rows, 2, sharey=True, squeeze=False).ravel()
+    for axes in panels[len(known) :]:
+        axes.set_axis_off()
+    for axes, name in zip(panels, known, strict=False):
         for method in results.methods:
             _scatter(axes, [point for point in points if point.method == method], name)
         axes.set_xlabel(FIGURES[name].heading)
         axes.grid(alpha=0.3)
         found = correlations(points, name)
         lines = [f"{where}: {found[where] or 'too few points'}" for where in ("all", "whole episodes")]
-        axes.set_title("\n".join([f"{name} and PSNR", *lines]), fontsize=10)
-    panels[0].set_ylabel("PSNR on held-out views [dB]")
-    _legend(picture, panels[:1])
+        axes.set_title("\n".join([f"{FIGURES[name].title} and PSNR", *lines]), fontsize=10)
+    for axes in panels[::2]:
+        axes.set_ylabel("PSNR on held-out views [dB]")
+    legend(picture, panels[:1])
     whole = sum(point.whole for point in points)
+    meanings = "; ".join(f"{FIGURES[name].title}: {FIGURES[name].meaning}" for name in known)
     return Drawn(
         picture,
         f"All {len(points)} reconstructions, of {results.seeds}: large points are the {whole} of whole "
-        f"episodes, small pale ones the {len(points) - whole} of first frames. Left: share of the held-out pixels that "
-        "the frames have seen; right: share of the floor cells observed. ρ is Spearman's, with a 95 % interval "
-        "(bootstrap over rollouts).",
+        f"episodes, small pale ones the {len(points) - whole} of first frames. {meanings}. ρ is Spearman's, with a "
+        "95 % interval (bootstrap over rollouts).",
     )
 
 
@@ -234,6 +239,7 @@ def _scatter(axes: "Axes", points: Sequence[Point], name: str) -> None:
         axes.scatter(shares, [point.psnr for point in chosen], label=label, linewidths=1.1, **look)
 
 
-def _legend(picture: "Figure", panels: Any) -> None:
+def legend(picture: "Figure", panels: Any) -> None:
+    """One for all panels, below them."""
     handles = {label: one for axes in panels for one, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     picture.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=6, fontsize=8)

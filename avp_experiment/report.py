@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from tyro.conf import Positional
 
-from avp_experiment import plots
+from avp_experiment import budgets, plots
 from avp_experiment.claims import claims
 from avp_experiment.configuration import ROOMS, TRAIN, UNSEEN
 from avp_experiment.pictures import DEFAULT_MAPS, maps, same_views
@@ -25,12 +25,22 @@ PAGE, CLAIMS, READING = "results.md", "claims.md", "reading.md"
 SCORES = ("psnr", "ssim", "lpips")
 COLUMNS = ("views", "coverage", "annd_m", "ei", "path_length_m", "visibility", "visibility_parallax", *SCORES)
 """The suite's figures that tables 2 and 3 show; those that users added follow."""
+_DEPTH, _MODEL = "geometry: the captured depth, fused", "geometry of the reconstructions"
 _TABLES = {
-    "table2": (TRAIN, "Table 2: scenes of training", COLUMNS),
-    "table2_geometry": (TRAIN, "Table 2, geometry: the captured depth, fused", GEOMETRY),
-    "table3": (UNSEEN, "Table 3: unseen scenes, no retraining", COLUMNS),
-    "table3_geometry": (UNSEEN, "Table 3, geometry: the captured depth, fused", GEOMETRY),
+    "table2": (TRAIN, "Table 2: scenes of training", COLUMNS, Results.values),
+    "table2_geometry": (TRAIN, f"Table 2, {_DEPTH}", GEOMETRY, Results.values),
+    "table2_model": (TRAIN, f"Table 2, {_MODEL}", GEOMETRY, Results.model_geometry),
+    "table3": (UNSEEN, "Table 3: unseen scenes, no retraining", COLUMNS, Results.values),
+    "table3_geometry": (UNSEEN, f"Table 3, {_DEPTH}", GEOMETRY, Results.values),
+    "table3_model": (UNSEEN, f"Table 3, {_MODEL}", GEOMETRY, Results.model_geometry),
 }
+_PARTS = {
+    "by_budget": ("By part of the budget", budgets.by_budget),
+    "by_scene": ("Completion ratio by scene", budgets.by_scene),
+}
+"""Tables that the page alone holds."""
+Values = Callable[[Results, str, str, str], Mapping[Key, float]]
+"""A figure of a method in scenes of a role, by episode."""
 Rows = Mapping[str, Mapping[str, Summary | None]]
 _SETTINGS = ("seeds", "starts", "budget", "observation", "steps", "steps_rooms", "width", "height", "reconstruction",
              "iterations")  # fmt: skip
@@ -39,9 +49,11 @@ _SETTINGS = ("seeds", "starts", "budget", "observation", "steps", "steps_rooms",
 def write_report(folder: Path, *, shown_maps: Sequence[str] = DEFAULT_MAPS) -> Path:
     """Write tables, figures (5 of some methods), claims and the page that holds them; gives the page."""
     results = read_results(folder)
-    parts = [
-        (title, partial(_table, role=role, columns=columns), name) for name, (role, title, columns) in _TABLES.items()
+    parts: list[tuple[str, Callable[[Results, str, str], str], str]] = [
+        (title, partial(_table, role=role, columns=columns, values=values), name)
+        for name, (role, title, columns, values) in _TABLES.items()
     ]
+    parts += [(title, partial(_only_here, make=make), name) for name, (title, make) in _PARTS.items()]
     parts += [(title, partial(_figure, draw=draw), name) for name, (title, draw) in _figures(shown_maps).items()]
     sections, left_out = [], []
     try:
@@ -70,24 +82,27 @@ def _figures(shown_maps: Sequence[str]) -> dict[str, tuple[str, Callable[[Result
         "figure6": ("Figure 6: the same held-out views", partial(same_views, role=TRAIN)),
         "figure6_unseen": ("Figure 6, unseen scene", partial(same_views, role=UNSEEN)),
         "psnr_by_views": ("PSNR by views", plots.psnr_by_views),
-        "visibility": ("Visibility and PSNR", plots.visibility_and_psnr),
+        "budgets": ("By part of the budget", budgets.curves),
+        "visibility": ("What predicts PSNR", plots.predictors_and_psnr),
     }
 
 
-def _table(results: Results, name: str, title: str, role: str, columns: Sequence[str]) -> str:
+def _only_here(results: Results, name: str, title: str, make: Callable[[Results], str]) -> str:
+    return make(results)
+
+
+def _table(results: Results, name: str, title: str, role: str, columns: Sequence[str], values: Values) -> str:
     """Write the table of the scenes of a role, as Markdown and as CSV; what the page holds of it."""
     paths = [results.folder / f"{name}.{suffix}" for suffix in ("md", "csv")]
     # One of an earlier state of the results would stand beside figures of this one.
     for path in paths:
         path.unlink(missing_ok=True)
     figures = {name: FIGURES[name] for name in columns} | (dict(results.figures) if columns is COLUMNS else {})
-    found = {
-        method: {name: results.values(method, role, name) for name in {*figures, "coverage"}}
-        for method in results.methods
-    }
-    found = {method: values for method, values in found.items() if values["coverage"]}
+    found = {method: {name: values(results, method, role, name) for name in figures} for method in results.methods}
+    found = {method: known for method, known in found.items() if any(known.values())}
     if not found:
-        raise plots.Missing("no episode there is done" if results.scenes(role) else "no such scene in this experiment")
+        nothing = "no episode there is done" if columns is COLUMNS else "no episode has such figures"
+        raise plots.Missing(nothing if results.scenes(role) else "no such scene in this experiment")
     shown = [figure for name, figure in figures.items() if any(values[name] for values in found.values())]
     if not shown:
         raise plots.Missing("no episode has such figures")
@@ -100,7 +115,7 @@ def _table(results: Results, name: str, title: str, role: str, columns: Sequence
     ]
     lines = table(["method", *(figure.heading for figure in shown)], cells, words=1)
     markdown = "\n".join([lines, *(f"\n{note}" for note in (*notes, *_notes(results, role, found)))])
-    episodes = {method: len(values["coverage"]) for method, values in found.items()}
+    episodes = {method: max(map(len, known.values())) for method, known in found.items()}
     paths[0].write_text(f"# {title}\n\n{markdown}\n", encoding="utf-8")
     _write_csv(paths[1], rows, shown, episodes)
     return (
@@ -127,7 +142,7 @@ def _write_csv(path: Path, rows: Rows, shown: Sequence[Figure], episodes: Mappin
 def _notes(results: Results, role: str, found: Mapping[str, Mapping[str, Mapping[Key, float]]]) -> list[str]:
     missing = [method for method in results.methods if method not in found]
     notes = [f"No episode of {', '.join(missing)}."] if missing else []
-    most = max(len(values["coverage"]) for values in found.values())
+    most = max(len(episodes) for known in found.values() for episodes in known.values())
     fewer = [
         f"{method} {len(values['coverage'])} episodes, {len(values['psnr'])} reconstructions"
         for method, values in found.items()

@@ -20,11 +20,13 @@ from avp_experiment.cells import COLLECT, RECONSTRUCT, TRAIN, Cell, floor_map
 from avp_experiment.configuration import Configuration, scene_slug
 from avp_experiment.folder import Folder, write_json
 from avp_habitat.errors import AVPError, UsageError
-from avp_habitat.metrics import FIGURES, Figure, figures
+from avp_habitat.metrics import FIGURES, GEOMETRY, Figure, figures
 from avp_habitat.provenance import PACKAGES, installed_versions
 
 FORMAT = 1
 FILE, PICTURES = "results.json", "pictures"
+_CURVES = {"coverage": "coverage", "visibility": "visibility", "visibility_parallax": "parallax"}
+"""Figures of which the whole course is kept, and what it is called in the file."""
 _KINDS = {"training": TRAIN, "rollouts": COLLECT, "reconstructions": RECONSTRUCT}
 Key = tuple[str, int, int]
 """Scene, seed and start: what two methods have in common."""
@@ -46,8 +48,8 @@ class EpisodeResult(_Measured):
 
     metrics: Mapping[str, float]
     """Of the whole episode."""
-    coverage_curve: tuple[float, ...]
-    """After each view, within [0, 1]."""
+    curves: Mapping[str, Mapping[int, float]]
+    """Figures by name, within [0, 1], by the number of views after which they are known."""
     floor: Mapping[str, Any] | None
     """Its map (`floor_map`) with its numbers, kept of the first episode only."""
 
@@ -62,8 +64,8 @@ class Reconstruction(_Measured):
     scores: Mapping[str, float]
     """`psnr` in dB, `ssim`, `lpips`, as far as they could be computed: means over the held-out views."""
     lpips_reason: str | None
-    visibility: float | None
-    """Share of the held-out pixels that its frames have seen."""
+    geometry: Mapping[str, float]
+    """Of its own depth, where it was measured."""
     psnr_by_view: tuple[float | None, ...]
     """In dB, of each held-out view."""
 
@@ -113,6 +115,26 @@ class Results:
         metrics = {one.key: one.metrics for one in self.rollouts if (one.method, one.role) == of}
         found = metrics if any(name in figures for figures in metrics.values()) else scores
         return {key: figures[name] for key, figures in found.items() if name in figures}
+
+    def model_geometry(self, method: str, role: str, name: str) -> dict[Key, float]:
+        """The same of the reconstructions' own geometry."""
+        found = [one for one in self.reconstructions if one.whole and (one.method, one.role) == (method, role)]
+        return {one.key: one.geometry[name] for one in found if name in one.geometry}
+
+    def after(self, method: str, role: str, name: str, share: float) -> dict[Key, float]:
+        """A figure by episode after a share of the budget; an episode that has ended by then counts with all it had."""
+        found = {}
+        for one in self.rollouts:
+            if (one.method, one.role) == (method, role) and (curve := one.curves.get(name)):
+                views = min(round(share * self.budget(one.key[0])), max(curve))
+                if views in curve:
+                    found[one.key] = curve[views]
+        return found
+
+    def budget(self, scene: str) -> int:
+        """Most views of an episode in a scene."""
+        budgets = (one.get("budget") for one in self.configuration["scenes"] if one["name"] == scene)
+        return next(budgets, None) or self.configuration["budget"]
 
     def reconstruction_curves(self, method: str, role: str) -> dict[Key, dict[int, Reconstruction]]:
         """By episode its reconstructions by number of frames, ascending; of episodes that have several, if any has."""
@@ -173,9 +195,20 @@ def _numbers(entry: Any) -> dict[str, float]:
 
 
 def _episode(entry: Any) -> EpisodeResult:
-    curve = tuple(float(share) for share in entry["coverage_curve"])
-    floor = entry.get("map") and {**entry["map"], "numbers": floor_of(entry["map"])}
-    return EpisodeResult(*_measured(entry), _numbers(entry["metrics"]), curve, floor)
+    metrics, floor = (
+        _numbers(entry["metrics"]),
+        entry.get("map") and {**entry["map"], "numbers": floor_of(entry["map"])},
+    )
+    # Results of before have none of parallax and geometry.
+    known = {name: entry.get(f"{key}_curve", ()) for name, key in _CURVES.items()}
+    curves = {name: {i: float(share) for i, share in enumerate(curve, 1)} for name, curve in known.items() if curve}
+    for views, found in entry.get("geometry_after", {}).items():
+        for name in found:
+            curves.setdefault(name, {})[int(views)] = float(found[name])
+    for name in GEOMETRY:
+        if name in metrics:
+            curves.setdefault(name, {})[round(metrics["views"])] = metrics[name]
+    return EpisodeResult(*_measured(entry), metrics, curves, floor)
 
 
 def _reconstruction(entry: Any) -> Reconstruction:
@@ -186,7 +219,7 @@ def _reconstruction(entry: Any) -> Reconstruction:
         whole=bool(entry["whole"]),
         scores=_numbers(entry["scores"]),
         lpips_reason=entry.get("lpips_reason"),
-        visibility=entry.get("visibility"),
+        geometry=_numbers(entry.get("geometry", {})),
         psnr_by_view=tuple(view.get("psnr") for view in entry["per_view"]),
     )
 
@@ -258,6 +291,7 @@ def _scored(cell: Cell, found: dict[str, Any], folder: Folder) -> dict[str, Any]
         "iterations": found["iterations"],
         "scores": found["scores"],
         "lpips_reason": found.get("lpips_reason"),
+        "geometry": found.get("geometry", {}),
         "visibility": seen.get("visibility"),
         "per_view": [
             {name: view.get(name) for name in ("psnr", "ssim", "lpips")} | {"visibility": share}

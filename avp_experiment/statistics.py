@@ -11,7 +11,7 @@ from avp_habitat.metrics import CONFIDENCE, Figure, mean_and_half_width
 
 NOTHING = "–"
 """What tables show where there is no figure."""
-PREDICTORS = ("visibility", "coverage")
+PREDICTORS = ("visibility", "visibility_parallax", "completion_ratio", "coverage")
 """What may predict PSNR."""
 RESAMPLES = 2000
 _BOOTSTRAP_SEED = 0
@@ -149,22 +149,23 @@ class Point:
     whole: bool
     """Of all frames of its episode."""
     shares: Mapping[str, float]
-    """Of the held-out pixels (`visibility`) and of the navigable cells (`coverage`) that its frames have seen."""
+    """`PREDICTORS` of its frames, as far as they are known, within [0, 1]."""
     psnr: float
     """In dB."""
 
 
 def points_of(results: Results) -> list[Point]:
-    """All reconstructions of which visibility, coverage and PSNR are known."""
-    curves = {(one.method, *one.key): one.coverage_curve for one in results.rollouts}
+    """All reconstructions of which a PSNR and every predictor that any has are known, so that these compare."""
+    curves = {(one.method, *one.key): one.curves for one in results.rollouts}
     points = []
     for one in results.reconstructions:
         rollout = (one.method, *one.key)
-        curve = curves.get(rollout, ())
-        if one.visibility is not None and "psnr" in one.scores and 1 <= one.frames <= len(curve):
-            shares = {"visibility": one.visibility, "coverage": curve[one.frames - 1]}
+        known = {name: curves.get(rollout, {}).get(name, {}) for name in PREDICTORS}
+        shares = {name: curve[one.frames] for name, curve in known.items() if one.frames in curve}
+        if shares and "psnr" in one.scores:
             points.append(Point(one.method, rollout, one.whole, shares, one.scores["psnr"]))
-    return points
+    known = {name for point in points for name in point.shares}
+    return [point for point in points if known <= set(point.shares)]
 
 
 def correlations(points: Sequence[Point], name: str) -> dict[str, Correlation | None]:

@@ -108,6 +108,8 @@ def _episode(rng, method, scene, seed, start):
         },
         "coverage_curve": [float(share) for share in curve],
         "visibility_curve": [float(0.8 * share) for share in curve],
+        "parallax_curve": [float(0.5 * share) for share in curve],
+        "geometry_after": {str(k): _geometry(float(curve[k - 1])) for k in (20, 40, 60) if k < views},
         "map": _map(rng, views) if seed == start == 0 else None,
     }
 
