@@ -136,6 +136,7 @@ def _reconstructions(rng, episode, prefixes, *, lpips):
             "iterations": 400,
             "scores": {"psnr": float(psnr), "ssim": 0.8, "lpips": 0.2 if lpips else None},
             "lpips_reason": None if lpips else "its weights are not there",
+            "geometry": _geometry(0.7 * episode["coverage_curve"][used - 1]),
             "visibility": episode["visibility_curve"][used - 1],
             "per_view": [{"psnr": float(psnr + shift), "ssim": 0.8, "visibility": 0.5} for shift in range(HELDOUT)],
         }

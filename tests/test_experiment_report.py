@@ -88,13 +88,18 @@ def test_the_tables_hold_means_and_intervals_over_seeds(whole, table, role):
         assert f" {mean:.2f} ± {half:.2f} " in line
 
 
-@pytest.mark.parametrize(("table", "role"), [("table2_geometry", "train"), ("table3_geometry", "unseen")])
-def test_geometry_has_tables_of_its_own(whole, table, role):
+@pytest.mark.parametrize("role", ["train", "unseen"])
+@pytest.mark.parametrize("of", ["geometry", "model"])
+def test_geometry_has_tables_of_its_own(whole, of, role):
     results, folder = whole
-    for method, row in rows_of(folder / f"{table}.csv").items():
-        ratio = by_seed(
-            results["rollouts"], lambda one: 100 * one["metrics"]["completion_ratio"], method=method, role=role
-        )
+    table = {"train": "table2", "unseen": "table3"}[role]
+    for method, row in rows_of(folder / f"{table}_{of}.csv").items():
+        whose = {"method": method, "role": role}
+        if of == "model":
+            found = results["reconstructions"]
+            ratio = by_seed(found, lambda one: 100 * one["geometry"]["completion_ratio"], whole=True, **whose)
+        else:
+            ratio = by_seed(results["rollouts"], lambda one: 100 * one["metrics"]["completion_ratio"], **whose)
         mean, half = interval(ratio)
         assert float(row["completion ratio [%]"]) == pytest.approx(mean, rel=1e-5)
         assert float(row["± completion ratio [%]"]) == pytest.approx(half, rel=1e-4)
