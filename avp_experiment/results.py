@@ -25,7 +25,9 @@ from avp_habitat.provenance import PACKAGES, installed_versions
 
 FORMAT = 1
 FILE, PICTURES = "results.json", "pictures"
-_KINDS = {"training": TRAIN, "rollouts": COLLECT, "reconstructions": RECONSTRUCT}
+PARTS = {"training": TRAIN, "rollouts": COLLECT, "reconstructions": RECONSTRUCT}
+"""Lists of what cells found, each with the kind of its cells."""
+_ORIGIN = ("command", "commits", "machine", "versions", "finished", "hours")
 Key = tuple[str, int, int]
 """Scene, seed and start: what two methods have in common."""
 
@@ -88,13 +90,17 @@ class Results:
     """In the order of the tables."""
     figures: Mapping[str, Figure]
     """Those that users added, by name."""
-    origin: Mapping[str, Any]
-    """Command, commits, machine, versions."""
+    origins: Mapping[str, Mapping[str, Any]]
+    """By label: command, commits, machine, versions; one, labelled as the folder, unless results were merged."""
+    sources: Mapping[str, Sequence[str]]
+    """By method: the labels of its origins."""
+    commits: Mapping[str, Sequence[str]]
+    """By method: of its own cells."""
     training: tuple[Training, ...]
     rollouts: tuple[EpisodeResult, ...]
     reconstructions: tuple[Reconstruction, ...]
     failed: tuple[Mapping[str, str], ...]
-    """`cell`, `reason` and `log` (relative to the folder) of what was tried in vain."""
+    """`cell`, `reason` and `log` (relative to the experiment's folder) of what was tried in vain; merged: `label`."""
 
     def scenes(self, role: str) -> list[str]:
         """Names of the scenes of a role, in the experiment's order."""
@@ -131,6 +137,11 @@ def floor_of(entry: Mapping[str, Any]) -> NDArray[np.uint16]:
 
 def read_results(folder: Path) -> Results:
     """Read the `results.json` of an experiment's folder; an `AVPError` where that is missing or damaged."""
+    return as_results(folder, load_results(folder))
+
+
+def load_results(folder: Path) -> dict[str, Any]:
+    """The content of a folder's `results.json`, of which only the format is checked."""
     path = folder / FILE
     if not path.is_file():
         raise UsageError(f"{folder}: expected the folder of an experiment (with {FILE}), found none")
@@ -141,21 +152,52 @@ def read_results(folder: Path) -> Results:
     found = value.get("format") if isinstance(value, dict) else type(value).__name__
     if found != FORMAT:
         raise AVPError(f"{path}: expected results of format {FORMAT}, found {found!r}")
+    return value
+
+
+def as_results(folder: Path, value: dict[str, Any]) -> Results:
+    """Check and convert the content of a folder's `results.json`; an `AVPError` where that is damaged."""
     try:
+        for scene in value["configuration"]["scenes"]:
+            _ = scene["name"], scene["sha256"], scene["role"]
+        # Only merged results have several.
+        origins = value["origins"] if "origins" in value else {folder.resolve().name: value["origin"]}
         return Results(
             folder=folder,
             configuration=value["configuration"],
             methods=tuple(value["methods"]),
             # Results of before users could add figures have none.
             figures={name: Figure(**entry) for name, entry in value.get("figures", {}).items()},
-            origin=value["origin"],
+            origins={label: {name: origin[name] for name in _ORIGIN} for label, origin in origins.items()},
+            sources=_sources(value, origins),
+            commits={method: commits_of(entries_of(value, method)) for method in value["methods"]},
             training=tuple(map(_training, value["training"])),
             rollouts=tuple(map(_episode, value["rollouts"])),
             reconstructions=tuple(map(_reconstruction, value["reconstructions"])),
             failed=tuple(value["failed"]),
         )
     except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
-        raise AVPError(f"{path}: missing or damaged: {error!r}") from None
+        raise AVPError(f"{folder / FILE}: missing or damaged: {error!r}") from None
+
+
+def entries_of(value: Mapping[str, Any], method: str) -> dict[str, list[Any]]:
+    """A method's entries in each of the `PARTS` of a `results.json`."""
+    return {part: [one for one in value[part] if one["method"] == method] for part in PARTS}
+
+
+def commits_of(entries: Mapping[str, Sequence[Any]]) -> list[str]:
+    """The commits of a method's entries, as far as they are known."""
+    return sorted({one["commit"] for part in entries.values() for one in part if one.get("commit")})
+
+
+def _sources(value: Mapping[str, Any], origins: Mapping[str, Any]) -> dict[str, list[str]]:
+    """By method the labels of its origins; all labels are held against the origins that are there."""
+    known = value["sources"] if "origins" in value else {method: [*origins] for method in value["methods"]}
+    found = {method: known[method] for method in value["methods"]}
+    for labels in (*found.values(), *([one["label"]] for one in value["failed"] if "label" in one)):
+        if not labels or not set(labels) <= set(origins):
+            raise ValueError(f"no origin of {labels}")
+    return found
 
 
 def _training(entry: Any) -> Training:
@@ -209,7 +251,7 @@ def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], 
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
             "hours": round(sum(record["seconds"] for _, record in done) / 3600, 2),
         },
-        **{part: [_entry(cell, folder) for cell, _ in done if cell.kind == kind] for part, kind in _KINDS.items()},
+        **{part: [_entry(cell, folder) for cell, _ in done if cell.kind == kind] for part, kind in PARTS.items()},
         "failed": [
             {"cell": cell.key, "reason": reason, "log": str(folder.log(cell).relative_to(folder.root))}
             for cell in cells
