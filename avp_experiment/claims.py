@@ -44,7 +44,8 @@ def claims(results: Results) -> str:
 
 
 def _failures(results: Results) -> list[str]:
-    lines = [f"- `{one['cell']}`: {one['reason']} (`{one['log']}`)" for one in results.failed]
+    named = [(one, f" of {one['label']}" if "label" in one else "") for one in results.failed]
+    lines = [f"- `{one['cell']}`{whose}: {one['reason']} (`{one['log']}`)" for one, whose in named]
     return ["\n".join(lines) or "None."]
 
 

@@ -120,8 +120,8 @@ def compare(configuration: Configuration, out: Path, *, jobs: int, line: str) ->
     Raises:
         AVPError: the folder cannot be used, or some cells failed; the others are done then.
     """
+    from avp_experiment.gathering import gather
     from avp_experiment.report import write_report
-    from avp_experiment.results import gather
 
     folder = open_folder(configuration, out)
     with folder.alone():

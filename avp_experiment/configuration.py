@@ -93,6 +93,11 @@ def chosen_methods(names: Sequence[str]) -> tuple[Method, ...]:
     return tuple(chosen)
 
 
+def without_label(method: str) -> str:
+    """The name of a method whose row of merged results is called `METHOD (LABEL)`."""
+    return method.partition(" (")[0]
+
+
 @dataclass(frozen=True)
 class FixedScene:
     """A scene that belongs to a preset, and must be the same for everybody."""

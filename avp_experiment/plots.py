@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from avp_experiment.configuration import ROOMS, TRAIN, TUNED, UNSEEN
+from avp_experiment.configuration import ROOMS, TRAIN, TUNED, UNSEEN, without_label
 from avp_experiment.results import Key, Results, Training
 from avp_experiment.statistics import PREDICTORS, Point, correlations, points_of, summary
 from avp_habitat.metrics import FIGURES
@@ -65,8 +65,8 @@ _OTHER = ("#A08060", "8")
 
 
 def style_of(method: str) -> tuple[str, str, str]:
-    """Colour, marker and line of a method; where trained in generated rooms, or tuned, those of what it is, dashed."""
-    plain = method.removesuffix(ROOMS).removesuffix(TUNED)
+    """Colour, marker and line of a method; in rooms, tuned, or another's of merged results: those of it, dashed."""
+    plain = without_label(method).removesuffix(ROOMS).removesuffix(TUNED)
     return *_STYLES.get(plain, _OTHER), "-" if plain == method else "--"
 
 

@@ -12,12 +12,13 @@ from tyro.conf import Positional
 
 from avp_experiment import budgets, plots
 from avp_experiment.claims import claims
-from avp_experiment.configuration import ROOMS, TRAIN, UNSEEN
+from avp_experiment.configuration import ROOMS, TRAIN, UNSEEN, without_label
+from avp_experiment.merging import merge
 from avp_experiment.pictures import DEFAULT_MAPS, maps, same_views
 from avp_experiment.results import FILE, Key, Results, read_results
 from avp_experiment.statistics import NOTHING, Summary, summary
 from avp_habitat import command
-from avp_habitat.errors import AVPError, unknown_name
+from avp_habitat.errors import AVPError, UsageError, unknown_name
 from avp_habitat.metrics import FIGURES, GEOMETRY, Figure
 from avp_habitat.tables import table
 
@@ -44,6 +45,8 @@ Values = Callable[[Results, str, str, str], Mapping[Key, float]]
 Rows = Mapping[str, Mapping[str, Summary | None]]
 _SETTINGS = ("seeds", "starts", "budget", "observation", "steps", "steps_rooms", "width", "height", "reconstruction",
              "iterations")  # fmt: skip
+_VERSIONS = ("python", "torch", "nerfstudio", "open3d", "habitat-sim")
+"""Told of every row, beside those that differ."""
 
 
 def write_report(folder: Path, *, shown_maps: Sequence[str] = DEFAULT_MAPS) -> Path:
@@ -67,7 +70,8 @@ def write_report(folder: Path, *, shown_maps: Sequence[str] = DEFAULT_MAPS) -> P
         reading = folder / READING
         read = [_below(reading.read_text(encoding="utf-8"))] if reading.is_file() else []
         end = "\n".join(["## Left out", "", *(left_out or ["Nothing."])])
-        text = "\n\n".join(["# Results of the experiment", _origin(results), *read, *sections, _below(said), end])
+        sections += [_below(said), f"## Where each row comes from\n\n{_sources(results)}", end]
+        text = "\n\n".join(["# Results of the experiment", _about(results), *read, *sections])
         (folder / PAGE).write_text(f"{text}\n", encoding="utf-8")
     except OSError as error:
         raise AVPError(f"{folder}: cannot write there: {error.strerror or error}") from None
@@ -150,7 +154,7 @@ def _notes(results: Results, role: str, found: Mapping[str, Mapping[str, Mapping
     ]
     if fewer:
         notes.append(f"Of fewer than {most} episodes or reconstructions: {'; '.join(fewer)}.")
-    if role == TRAIN and any(method.endswith(ROOMS) for method in found):
+    if role == TRAIN and any(without_label(method).endswith(ROOMS) for method in found):
         notes.append(f"Methods whose name ends in `{ROOMS}` were trained in generated rooms, never in these scenes.")
     return notes
 
@@ -178,45 +182,78 @@ def _below(text: str) -> str:
     return "\n".join(f"#{line}" if line.startswith("#") else line for line in text.strip().splitlines())
 
 
-def _origin(results: Results) -> str:
-    origin, configuration = results.origin, results.configuration
-    machine = origin["machine"] | {"gpu": origin["machine"]["gpu"] or "no GPU"}
+def _about(results: Results) -> str:
+    configuration = results.configuration
     settings = ", ".join(f"{name} {configuration[name]}" for name in _SETTINGS if name in configuration)
     about = {
-        "command": f"`{origin['command']}`",
         "preset": f"{configuration.get('preset', 'not known')}: {settings}",
         "scenes": ", ".join(f"{scene['name']} ({scene['role']})" for scene in configuration["scenes"]),
-        "commits": ", ".join(f"`{commit[:12]}`" for commit in origin["commits"]) or "not known",
-        "machine": "{platform}, {processor}, {cores} cores, {gpu}".format(**machine),
-        "versions": ", ".join(f"{name} {version}" for name, version in origin["versions"].items()),
-        "finished": f"{origin['finished']}, {origin['hours']} hours of work in all cells",
         "failed cells": str(len(results.failed)) + (" (see below)" if results.failed else ""),
     }
+    for label, origin in results.origins.items():
+        versions = ", ".join(f"{name} {version}" for name, version in origin["versions"].items())
+        done = f"finished {origin['finished']}, {origin['hours']} hours of work in all cells"
+        about[f"results of {label}"] = f"`{origin['command']}`, {done}; {versions}"
     made = f"Made from [`{FILE}`]({FILE}) by `python -m avp_experiment.report FOLDER`; data and settings are all in it."
     return "\n".join([made, "", *(f"- {name}: {value}" for name, value in about.items())])
+
+
+def _sources(results: Results) -> str:
+    """A table with a line for each method and each experiment that measured it."""
+    versions = [origin["versions"] for origin in results.origins.values()]
+    known = dict.fromkeys(name for one in versions for name in one)
+    shown = [name for name in known if name in _VERSIONS or len({one.get(name) for one in versions}) > 1]
+    rows = []
+    for method in results.methods:
+        for label in results.sources[method]:
+            origin = results.origins[label]
+            machine = origin["machine"] | {"gpu": origin["machine"]["gpu"] or "no GPU"}
+            rows.append(
+                [
+                    method,
+                    label,
+                    ", ".join(f"`{commit[:12]}`" for commit in results.commits[method]) or "not known",
+                    ", ".join(f"{name} {origin['versions'].get(name, NOTHING)}" for name in shown),
+                    "{platform}, {processor}, {cores} cores, {gpu}".format(**machine),
+                    f"`{origin['command']}`",
+                ]
+            )
+    return table(["method", "results", "commits", "versions", "machine", "command"], rows)
 
 
 @dataclass(frozen=True)
 class ReportOptions:
     """Make every table and figure of an experiment from its results.json, and the page that holds them, results.md.
 
-    A file reading.md beside them, written by hand, becomes a part of the page. What cannot be made is left out; the
-    page says why.
+    Those of several experiments of the same settings are merged first. A file reading.md beside them, written by hand,
+    becomes a part of the page. What cannot be made is left out; the page says why.
     """
 
-    folder: Positional[Path]
-    """Of an experiment: holds results.json."""
+    folders: Positional[tuple[Path, ...]]
+    """Of experiments: each holds results.json."""
+    out: Path | None = None
+    """Folder for the merged results and their report: new, empty, or of an earlier merge, which is replaced."""
     maps: tuple[str, ...] = DEFAULT_MAPS
     """Methods of figure 5."""
+
+    def __post_init__(self) -> None:
+        """One folder, or several and one to merge them into."""
+        if not self.folders:
+            raise UsageError("expected the folder of an experiment, or several and --out FOLDER, got none")
+        if self.out is None and len(self.folders) > 1:
+            raise UsageError(f"out: {len(self.folders)} folders are merged into another: expected --out FOLDER")
 
 
 def main(options: ReportOptions) -> None:
     """Make the tables and figures again."""
-    known = (*read_results(options.folder).methods, *DEFAULT_MAPS)
+    merged = merge(options.folders, options.out) if options.out else None
+    known = (*(merged.content["methods"] if merged else read_results(options.folders[0]).methods), *DEFAULT_MAPS)
     for name in options.maps:
         if name not in known:
             raise unknown_name("method of --maps", name, known)
-    print(f"report: {write_report(options.folder, shown_maps=options.maps)}")
+    if merged:
+        merged.write()
+    print(f"report: {write_report(options.out or options.folders[0], shown_maps=options.maps)}")
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from avp_experiment import compare, report
 from avp_experiment.cells import TRAIN, plan
 from avp_experiment.configuration import PRESETS
 from avp_experiment.folder import open_folder
-from avp_experiment.results import gather
+from avp_experiment.gathering import gather
 from avp_habitat import command
 
 SAMPLE = Path(__file__).resolve().parent / "data" / "before" / "experiment.tar.xz"
