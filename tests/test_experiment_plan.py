@@ -180,7 +180,7 @@ def refused(capsys, *words):
         (
             ("--preset", "cpuu"),
             2,
-            "unknown preset 'cpuu': expected one of benchmark-v1, benchmark-v1-full, cpu, demo, gpu, paper, smoke; did you mean",
+            "expected one of benchmark-v1, benchmark-v1-full, cpu, demo, gpu, paper, smoke; did you mean 'cpu'?",
         ),
         (("--methods", "heuristic,propposed"), 2, "did you mean 'proposed'?"),
         (("--methods", ","), 2, "methods: expected at least one"),

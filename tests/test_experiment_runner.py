@@ -113,3 +113,26 @@ def test_a_command_that_dies_is_told_by_its_signal(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     runner = experiment_walks.run(tmp_path, [replace(cell, words=("python", "-m", "dies"))])
     assert runner.failed[cell.key].startswith("killed by signal 11")
+
+
+def test_a_method_that_raises_in_the_middle_of_an_episode_fails_alone(tmp_path, monkeypatch):
+    whole, other = experiment_walks.rollouts(tmp_path)[:2]
+    (tmp_path / "theirs.py").write_text(
+        "class Tires:\n"
+        "    def __init__(self, env, seed=None):\n"
+        "        self.views = 0\n"
+        "    def predict(self, observation, state=None, episode_start=None, deterministic=False):\n"
+        "        self.views += 1\n"
+        "        if self.views > 2:\n"
+        "            raise RuntimeError('too tired for view 3')\n"
+        "        return 1, None\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    words = list(other.words)
+    words[words.index("--policy") + 1] = "theirs:Tires"
+    tired = replace(other, words=tuple(words))
+    runner = experiment_walks.run(tmp_path, [tired, whole])
+    assert list(runner.failed) == [tired.key]
+    assert "too tired for view 3" in runner.failed[tired.key]
+    assert not tired.output(tmp_path).exists()
+    assert Folder(tmp_path).is_done(whole)

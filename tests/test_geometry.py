@@ -230,6 +230,22 @@ def test_what_the_task_was_is_read_from_the_rollout_itself(tmp_path, capsys):
     assert "rollout.json: " in capsys.readouterr().err
 
 
+def test_geometry_of_the_first_views_is_that_of_an_episode_of_so_many(tmp_path):
+    options = collect.Collect("builtin:3", "heuristic", tmp_path / "long", width=64, height=48, geometry=True, budget=9)
+    collect.collect(replace(options, geometry_after=(4, 9, 20)))
+    short = collect.collect(replace(options, out=tmp_path / "short", budget=4))
+    after = json.loads((tmp_path / "long" / "rollout.json").read_text())["geometry_after"]
+    assert list(after) == ["4"]
+    assert [after["4"][name] for name in GEOMETRY] == pytest.approx([short[name] for name in GEOMETRY], rel=1e-3)
+
+
+@pytest.mark.parametrize("words", [("--geometry-after", "4"), ("--geometry", "--geometry-after", "0")])
+def test_geometry_after_numbers_of_views_needs_geometry_and_numbers(tmp_path, capsys, words):
+    line = ["--scene", "builtin:3", "--policy", "spin", "--out", str(tmp_path / "r"), *words]
+    assert command.run(collect.main, line) == 2
+    assert "--geometry-after: expected numbers from 1, and --geometry" in capsys.readouterr().err
+
+
 def test_a_bad_shape_among_good_ones_does_not_lose_them(rollout, capsys):
     assert command.run(geometry.main, [str(rollout), "missing", "--scene", "builtin:3"]) == 1
     said = capsys.readouterr()
