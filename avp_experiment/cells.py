@@ -69,10 +69,11 @@ def plan(configuration: Configuration, root: Path, *, tracking: str) -> list[Cel
     """All cells, each after the one that it needs; trainings are logged to the MLflow experiment `tracking`."""
     planner = _Planner(configuration, root, tracking)
     cells: list[Cell] = []
+    trainings = configuration.preset.trainings or configuration.preset.seeds
     for seed in range(configuration.preset.seeds):
         for method in configuration.methods:
-            training = planner.training(method, seed) if method.learned else None
-            cells += [training] if training else []
+            training = planner.training(method, seed % trainings) if method.learned else None
+            cells += [training] if training and seed < trainings else []
             for scene in configuration.scenes:
                 for start in range(configuration.preset.starts):
                     rollout = planner.rollout(method, seed, scene, start, training)

@@ -117,7 +117,7 @@ class ExperimentPreset:
     steps_rooms: int
     """Environment steps of a training in generated rooms."""
     seeds: int = 3
-    """Trainings of each reward, and places to start from."""
+    """Trainings of each reward, unless `trainings` says otherwise, and places to start from."""
     starts: int = 1
     """Episodes of each method, scene and seed."""
     observation: str = "map"
@@ -136,6 +136,8 @@ class ExperimentPreset:
     """Held-out views whose renders are kept."""
     methods: tuple[str, ...] = DEFAULT
     """Compared where the user names none."""
+    trainings: int | None = None
+    """So many seeds are trained, whose policies the other seeds' places get in turn; None: every seed."""
     benchmark: bool = False
     """Nothing is trained in the scenes, and neither seeds nor scenes of its own can be exchanged."""
     fixed: tuple[FixedScene, ...] = ()
@@ -161,6 +163,8 @@ PRESETS = {
     "benchmark-v1": ExperimentPreset(
         0,
         500_000,
+        seeds=6,
+        trainings=3,
         size=(192, 144),
         iterations=500,
         prefixes=(20, 40),
@@ -247,7 +251,7 @@ class Configuration:
         for name in ("methods", "fixed"):
             del values[name]
         # Experiments of before know none of these.
-        for name in ("benchmark", "geometry_after", "reconstructed", "model_geometry"):
+        for name in ("trainings", "benchmark", "geometry_after", "reconstructed", "model_geometry"):
             if values[name] == getattr(ExperimentPreset, name):
                 del values[name]
         width, height = values.pop("size")

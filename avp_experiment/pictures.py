@@ -18,23 +18,25 @@ if TYPE_CHECKING:
 
 NOT_NAVIGABLE, NEVER = 0, 1
 """Numbers of a floor; one of 1 + t was first observed by view t."""
-DEFAULT_MAPS = ("heuristic", "coverage", "proposed")
-"""Methods of figure 5."""
-DEFAULT_RENDERS = ("heuristic", "proposed", "surface", "pretrained", "pretrained_tuned", "survey", "coverage")
+MAPS = ("heuristic", "coverage", "proposed", "nbv", "pretrained")
+"""Methods of figure 5 where nobody chooses: the first three that are there."""
+DEFAULT_RENDERS = ("heuristic", "proposed", "surface", "nbv", "pretrained", "pretrained_tuned", "survey", "coverage",
+                   "greedy")  # fmt: skip
 """Methods of figure 6, as far as they are there; else the first ones."""
 _COLUMNS = 5
 _ARROW_M = 0.22
 _UNSEEN_COLOUR, _PATH_COLOUR = "#C9CCD2", "#B22234"
 
 
-def maps(results: Results, methods: Sequence[str] = DEFAULT_MAPS) -> Drawn:
+def maps(results: Results, methods: Sequence[str] = ()) -> Drawn:
     """Figure 5: episodes from above, a row for the first scene of training and one for the first unseen one."""
+    methods = methods or [method for method in MAPS if method in results.methods][:3]
     drawn = {(one.method, one.key[0]): one for one in results.rollouts if one.floor is not None}
     scenes = [names[0] for role in (TRAIN, UNSEEN) if (names := results.scenes(role))]
     scenes = [scene for scene in scenes if any((method, scene) in drawn for method in methods)]
     shown = [method for method in methods if any((method, scene) in drawn for scene in scenes)]
     if not shown:
-        raise Missing(f"no episode of {', '.join(methods)} has a map")
+        raise Missing(f"no episode of {', '.join(methods or MAPS)} has a map")
     numbers = {which: one.floor["numbers"] for which, one in drawn.items() if one.floor and which[0] in shown}
     last = max(int(floor.max()) - 1 for floor in numbers.values())
     tallest = [max(np.divide(*floor.shape) for (_, of), floor in numbers.items() if of == scene) for scene in scenes]

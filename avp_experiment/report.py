@@ -14,7 +14,7 @@ from avp_experiment import budgets, plots
 from avp_experiment.claims import claims
 from avp_experiment.configuration import ROOMS, TRAIN, UNSEEN, without_label
 from avp_experiment.merging import merge
-from avp_experiment.pictures import DEFAULT_MAPS, maps, same_views
+from avp_experiment.pictures import maps, same_views
 from avp_experiment.results import FILE, Key, Results, read_results
 from avp_experiment.statistics import NOTHING, Summary, summary
 from avp_habitat import command
@@ -49,7 +49,7 @@ _VERSIONS = ("python", "torch", "nerfstudio", "open3d", "habitat-sim")
 """Told of every row, beside those that differ."""
 
 
-def write_report(folder: Path, *, shown_maps: Sequence[str] = DEFAULT_MAPS) -> Path:
+def write_report(folder: Path, *, shown_maps: Sequence[str] = ()) -> Path:
     """Write tables, figures (5 of some methods), claims and the page that holds them; gives the page."""
     results = read_results(folder)
     parts: list[tuple[str, Callable[[Results, str, str], str], str]] = [
@@ -233,8 +233,8 @@ class ReportOptions:
     """Of experiments: each holds results.json."""
     out: Path | None = None
     """Folder for the merged results and their report: new, empty, or of an earlier merge, which is replaced."""
-    maps: tuple[str, ...] = DEFAULT_MAPS
-    """Methods of figure 5."""
+    maps: tuple[str, ...] = ()
+    """Methods of figure 5 (omitted: three that most ask for)."""
 
     def __post_init__(self) -> None:
         """One folder, or several and one to merge them into."""
@@ -247,7 +247,7 @@ class ReportOptions:
 def main(options: ReportOptions) -> None:
     """Make the tables and figures again."""
     merged = merge(options.folders, options.out) if options.out else None
-    known = (*(merged.content["methods"] if merged else read_results(options.folders[0]).methods), *DEFAULT_MAPS)
+    known = merged.content["methods"] if merged else read_results(options.folders[0]).methods
     for name in options.maps:
         if name not in known:
             raise unknown_name("method of --maps", name, known)

@@ -47,7 +47,13 @@ def test_no_scene_of_the_benchmark_is_ever_trained_in(benchmark, tmp_path):
         rooms = cell.words[cell.words.index("--scene") + 1 : cell.words.index("--reward")]
         assert len(rooms) == V1.rooms
         assert not set(rooms) & {scene.spec for scene in benchmark.scenes}
-    assert Counter(cell.kind for cell in cells)[TRAIN] == V1.seeds
+    assert Counter(cell.kind for cell in cells)[TRAIN] == V1.trainings < V1.seeds
+
+
+def test_places_of_later_seeds_get_the_policies_of_the_first_in_turn(benchmark, tmp_path):
+    cells = [cell for cell in plan(benchmark, tmp_path, tracking="avp") if cell.kind == COLLECT and cell.needs]
+    assert {(cell.seed, cell.needs.seed) for cell in cells} == {(seed, seed % 3) for seed in range(6)}
+    assert all(option(cell, "--policy") == str(cell.needs.output(tmp_path)) for cell in cells)
 
 
 def test_each_scene_has_its_budget_and_geometry_after_the_same_parts_of_it(benchmark, tmp_path):
@@ -75,7 +81,15 @@ def test_what_was_known_of_presets_is_written_as_before_and_what_is_new_is_added
     assert kept["geometry_after"] == [20, 40, 60]
     assert {scene["name"]: scene.get("budget") for scene in kept["scenes"]}[FIXED[2]] == 196
     old = compare.Compare(preset="smoke", unseen="none").configuration().as_json()
-    assert not {"benchmark", "geometry_after", "reconstructed", "model_geometry", "methods", "fixed"} & set(old)
+    assert not {
+        "trainings",
+        "benchmark",
+        "geometry_after",
+        "reconstructed",
+        "model_geometry",
+        "methods",
+        "fixed",
+    } & set(old)
 
 
 def test_a_generated_scene_that_came_out_otherwise_is_refused(monkeypatch, capsys):
@@ -88,7 +102,7 @@ def test_a_generated_scene_that_came_out_otherwise_is_refused(monkeypatch, capsy
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (("--seeds", "1"), "seeds: benchmark-v1 has 3, got 1; more starts are welcome"),
+        (("--seeds", "1"), "seeds: benchmark-v1 has 6, got 1; more starts are welcome"),
         (("--scene", "builtin:0"), "scene: nothing is trained in the scenes of a benchmark; give builtin:0 as unseen"),
         (("--methods", "nbv,proposed"), "methods: nothing is trained in the scenes of benchmark-v1, as proposed would"),
         (("--methods", "pretrained_tuned"), "as pretrained_tuned would be; expected a policy or REWARD_rooms"),
