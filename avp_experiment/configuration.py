@@ -176,7 +176,7 @@ PRESETS = {
             FixedScene("builtin-home:100000", "3b9143c7e53eb82b53636ce2ad158f46c692b35b6006e7d682e5c01e92f224b5", 196),
             FixedScene("builtin-home:100001", "2f767ed80be0d3964437f7d8a018706f1c14d0f599a059c9ad1b7f447ea082f9", 173),
         ),
-        geometry_after=(20, 40, 60),
+        geometry_after=(40,),
         reconstructed=1,
         model_geometry=True,
     ),

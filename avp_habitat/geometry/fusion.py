@@ -14,6 +14,8 @@ VOXEL_M = 0.0125
 TRUNCATION_M = 0.04
 """Distances to the surface are known up to this, metres. More of it lets silhouettes leave more false surface."""
 _BLOCK, _BLOCKS, _STRIDE = 8, 20_000, 4
+_ORDER = np.array([1.0, np.sqrt(2), np.pi], np.float32)
+"""A direction along which no two triangles lie alike."""
 
 
 class Fusion:
@@ -71,7 +73,8 @@ class Fusion:
         if not len(triangles):
             return None
         # Open3D's threads give them in any order, and samples of the surface depend on it.
-        return Shape(vertices, triangles[np.lexsort(vertices[triangles].sum(axis=1).T)])
+        place = (vertices @ _ORDER)[triangles].sum(axis=1)
+        return Shape(vertices, triangles[np.argsort(place, kind="stable")])
 
     def _camera(self, by: int) -> Any:
         """For images enlarged by a factor; Open3D cuts a pixel's coordinates, so it counts from corners as we do."""
