@@ -31,7 +31,7 @@ from avp_habitat.ranges import Range, hold_ranges
 from avp_habitat.rollout.capture import capture_heldout, capture_step, publish_rollout
 from avp_habitat.rollout.writing import RolloutWriter
 from avp_habitat.scenes.location import HELP as SCENES
-from avp_habitat.sight.heldout import VIEWS
+from avp_habitat.sight.heldout import VIEWS, HeldoutKind
 from avp_habitat.simulators.base import Simulator
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
 from avp_habitat.task.budget import BUDGET_HELP, Budget, budget_for
@@ -70,6 +70,8 @@ class Collect:
     """Of the pictures in pixels."""
     height: Annotated[int, Range(8, 8192)] = 480
     """Of the pictures in pixels."""
+    heldout: HeldoutKind = "standard"
+    """Held-out views: with pitches up to 20 degrees, or up to 45 degrees where the navigable area can show all."""
     geometry: bool = False
     """Also measure how true the fused depth is (accuracy, completion …); takes ten seconds or more."""
     geometry_after: tuple[int, ...] = ()
@@ -131,7 +133,7 @@ def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: 
                 capture_step(env, writer, step.action, step.reward, info)
                 bar.update()
             bar.total -= settings.budget - info["views"]
-            capture_heldout(env, writer, heldout, progress=bar.update)
+            capture_heldout(env, writer, heldout, kind=options.heldout, progress=bar.update)
         return publish_rollout(
             env,
             writer,
@@ -139,6 +141,7 @@ def collect(options: Collect, *, settings: TaskSettings | None = None, heldout: 
             policy={"name": Path(name_of(options.policy)).name, "deterministic": not options.stochastic},
             seed=options.seed,
             heldout=heldout,
+            kind=options.heldout,
             geometry=options.geometry_after if measured else None,
             mlflow_run_id=getattr(policy, "avp_mlflow_run_id", None) or os.environ.get("MLFLOW_RUN_ID"),
         )

@@ -9,7 +9,7 @@ from avp_habitat.errors import SimulatorError, UsageError
 from avp_habitat.geometry.shape import Shape
 from avp_habitat.poses import Intrinsics, wrap_angle
 from avp_habitat.scenes.mesh import without_holes
-from avp_habitat.sight.heldout import heldout_poses
+from avp_habitat.sight.heldout import LEAST_SHARE, PLACES, heldout_poses, lookouts, steepest_elevation
 from avp_habitat.sight.tables import once_per_simulator
 from avp_habitat.simulators.base import Meshed, Simulator
 from avp_habitat.task.motion import sensor_poses
@@ -19,11 +19,6 @@ Float = NDArray[np.floating]
 
 SAMPLES = 100_000
 """Points, uniform over the area of all the scene's surface, of which the observable ones are kept."""
-PLACES = 100
-"""Looked at from so many places all over the navigable area."""
-LEAST_SHARE = 0.02
-"""A point is observable where at least this share of the places see it. With one place as the limit, more places would
-always find more, through ever smaller gaps."""
 CAMERA = Intrinsics.from_hfov(160, 120, hfov_deg=90.0)
 """Of the depth images of the held-out views."""
 SCAN_VIEWS = 60
@@ -66,9 +61,7 @@ def scene_truth(
     mesh = without_holes(simulator.surface_mesh(), _PIECE_M)
     whole = Shape(mesh.vertices, mesh.triangles)
     points = whole.samples(samples)
-    centres = simulator.area.centres
-    feet = centres[np.unique(np.linspace(0, len(centres) - 1, places).astype(int))]
-    seen = observable(points, whole, feet + [0.0, settings.sensor_height_m, 0.0], settings)
+    seen = observable(points, whole, lookouts(simulator, settings, places), settings)
     if not seen.any():
         raise UsageError(f"{simulator.scene}: no surface can be seen from its navigable area")
     poses = heldout_poses(simulator, sensor_height_m=settings.sensor_height_m)
@@ -92,11 +85,9 @@ def scan_poses(simulator: Simulator, settings: TaskSettings, views: int = SCAN_V
 def observable(points: Float, whole: Shape, eyes: Float, settings: TaskSettings) -> NDArray[np.bool_]:
     """`(n,)` which of `(n, 3)` points of a shape a camera at `LEAST_SHARE` of `(k, 3)` eyes can see.
 
-    The camera can turn to any yaw, so that only elevation limits it: half the image's height beyond the greatest pitch.
+    The camera can turn to any yaw, so that only elevation limits it.
     """
-    camera = settings.intrinsics
-    half = np.arctan(camera.height / 2 / camera.fy)
-    steepest = min(np.radians(settings.pitch_limit_deg) + half, np.pi / 2)
+    steepest = steepest_elevation(settings)
     count, needed = np.zeros(len(points), np.int64), max(1, round(LEAST_SHARE * len(eyes)))
     for eye in eyes:
         offset = points - eye

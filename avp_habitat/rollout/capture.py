@@ -30,7 +30,7 @@ from avp_habitat.rollout.images import write_numbers, write_rgb
 from avp_habitat.rollout.origin import task_of
 from avp_habitat.rollout.seen import visibility_of
 from avp_habitat.rollout.writing import RolloutWriter
-from avp_habitat.sight.heldout import VIEWS, heldout_poses, heldout_seed
+from avp_habitat.sight.heldout import VIEWS, HeldoutKind, chosen_poses, heldout_seed
 from avp_habitat.task.env import AVPEnv
 from avp_habitat.task.settings import ACTION_NAMES
 from avp_habitat.task.trajectory import Trajectory
@@ -46,12 +46,17 @@ def capture_step(env: AVPEnv, writer: RolloutWriter, action: int, reward: float,
 
 
 def capture_heldout(
-    env: AVPEnv, writer: RolloutWriter, views: int, *, progress: Callable[[], object] = lambda: None
+    env: AVPEnv,
+    writer: RolloutWriter,
+    views: int,
+    *,
+    kind: HeldoutKind = "standard",
+    progress: Callable[[], object] = lambda: None,
 ) -> None:
-    """Write so many held-out views of the scene; `progress` is called after each."""
+    """Write so many held-out views of the scene, of a kind; `progress` is called after each."""
     if not views:
         return
-    for pose in heldout_poses(env.simulator, sensor_height_m=env.settings.sensor_height_m, views=views):
+    for pose in chosen_poses(kind, env.simulator, env.settings, views):
         writer.add_heldout(*_pictured(env, writer, pose))
         progress()
 
@@ -72,6 +77,7 @@ def publish_rollout(
     heldout: int,
     mlflow_run_id: str | None = None,
     geometry: Sequence[int] | None = None,
+    kind: HeldoutKind = "standard",
 ) -> dict[str, Any]:
     """Draw the trajectory and the floor, measure what was seen, and publish the folder.
 
@@ -83,6 +89,7 @@ def publish_rollout(
         seed: of the episode's start; None when it was not seeded itself.
         heldout: number of held-out views written.
         mlflow_run_id: of the training that the policy comes from.
+        kind: of the held-out views.
         geometry: None, or measure how true the fused depth is, also of the first so many views; takes some seconds.
 
     Returns:
@@ -95,7 +102,7 @@ def publish_rollout(
     write_rgb(writer.path("trajectory.png"), draw_trajectory(env.area, info["avp_trajectory"]))
     floor = _write_floor(env.area, info["avp_trajectory"], writer)
     frames, views = writer.views(heldout=False), writer.views(heldout=True)
-    rollout = Rollout(writer.path(""), _scene_and_task(env, heldout), writer.intrinsics, frames, views)
+    rollout = Rollout(writer.path(""), _scene_and_task(env, heldout, kind), writer.intrinsics, frames, views)
     # From the files, in whole millimetres, so that the figure is the one that a reader of the folder computes.
     seen = visibility_of(frames, views, writer.intrinsics).figures() if views else {}
     visibility = {name: seen[name] for name in ("visibility", "visibility_parallax") if name in seen}
@@ -139,7 +146,7 @@ def _step_row(env: AVPEnv, action: int, reward: float, info: dict[str, Any]) -> 
     }
 
 
-def _scene_and_task(env: AVPEnv, heldout: int) -> dict[str, Any]:
+def _scene_and_task(env: AVPEnv, heldout: int, kind: HeldoutKind) -> dict[str, Any]:
     settings, area = env.settings, env.area
     return {
         "scene": {"name": env.scene_name, "sha256": env.scene_digest, **asdict(env.simulator.scene_frame)},
@@ -163,7 +170,7 @@ def _scene_and_task(env: AVPEnv, heldout: int) -> dict[str, Any]:
             "navigable_cells": len(area.centres),
             "navigable_area_m2": round(float(area.area_m2), 4),
         },
-        "heldout": {"views": heldout, "seed": str(heldout_seed(env.scene_digest))},
+        "heldout": {"views": heldout, "kind": kind, "seed": str(heldout_seed(env.scene_digest))},
         "versions": installed_versions(_VERSIONED),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
