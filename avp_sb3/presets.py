@@ -63,7 +63,7 @@ ONBOARD = PPOPreset(
     learning_rate=5e-4,
     linear=True,
     ent_coef=0.02,
-    gamma=0.995,
+    gamma=0.98,
     net_arch=(256, 128),
 )
 """For what a robot knows; of many scenes, in which many agents of a scene share the cost of a call."""

@@ -29,7 +29,7 @@ class RewardConstants:
     """α of `surface`: reward per (newly seen surface point)^β, each weighted by how well it is seen (`surfaces`)."""
     alpha_multiview: Amount = 0.02
     """α_m of `multiview`: reward per (growth of Q and S, by their weights)^β."""
-    single_weight: Annotated[float, Range(0, 1)] = 0.2
+    single_weight: Annotated[float, Range(0, 1)] = 0.5
     """w of `multiview`: weight of how well points are seen in one view (Q); 1 - w is that of two views (S)."""
     beta: Annotated[float, Range(0, 1)] = 0.9
     """β of `proposed`, `surface` and `multiview`, no unit, below 1: much that is new at once counts less than step
