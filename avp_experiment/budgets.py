@@ -1,7 +1,5 @@
 """What methods know after parts of the budget: tables of a figure by part and by scene, and its curves."""
 
-import numpy as np
-
 from avp_experiment.configuration import TRAIN, UNSEEN
 from avp_experiment.plots import Drawn, Missing, legend, new_figure, style_of
 from avp_experiment.results import Results
@@ -9,9 +7,9 @@ from avp_experiment.statistics import NOTHING, Summary, summary
 from avp_habitat.metrics import FIGURES
 from avp_habitat.tables import table
 
-PARTS = (0.25, 0.5, 0.75, 1.0)
+SHARES = (0.25, 0.5, 0.75, 1.0)
 """Of the budget."""
-SHOWN = ("visibility", "visibility_parallax", "completion_ratio")
+SHOWN = ("coverage", "visibility", "visibility_parallax", "completion_ratio")
 _ROLE = {UNSEEN: "unseen scenes", TRAIN: "scenes of training"}
 
 
@@ -21,20 +19,21 @@ def by_budget(results: Results) -> str:
     Raises:
         Missing: no figure is known after a part of the budget.
     """
-    heads = [_part(results, part) for part in PARTS]
     parts = []
     for role, where in _ROLE.items():
         for name in SHOWN:
-            rows = {
-                method: [summary(results.after(method, role, name, part)) for part in PARTS]
-                for method in results.methods
-            }
-            # Of one part alone, that of all views, other tables tell.
-            if any(len(list(filter(None, row))) > 1 for row in rows.values()):
+            shares = _known(results, role, name)
+            # Of all views alone other tables tell.
+            if len(shares) > 1:
+                rows = {
+                    method: [summary(results.after(method, role, name, share)) for share in shares]
+                    for method in results.methods
+                }
+                heads = [_head(results, share) for share in shares]
                 parts.append(f"{FIGURES[name].heading}, {where}:\n\n{_table(heads, rows, name)}")
     if not parts:
         raise Missing("no figure is known after a part of the budget")
-    return "\n\n".join(parts)
+    return "\n\n".join([*parts, *(note for role in _ROLE for note in results.unvisited(role))])
 
 
 def by_scene(results: Results) -> str:
@@ -56,19 +55,19 @@ def by_scene(results: Results) -> str:
 
 def curves(results: Results) -> Drawn:
     """Visibility, parallax and completion ratio by part of the budget, in unseen scenes."""
-    known = [name for name in SHOWN if any(results.after(method, UNSEEN, name, 0.5) for method in results.methods)]
+    known = {name: shares for name in SHOWN if len(shares := _known(results, UNSEEN, name)) > 1}
     if not known:
         raise Missing("no figure is known after a part of the budget")
-    picture = new_figure(4.4)
+    picture = new_figure(4.2)
     panels = picture.subplots(1, len(known), squeeze=False)[0]
-    for axes, name in zip(panels, known, strict=True):
+    for axes, (name, shares) in zip(panels, known.items(), strict=True):
         for method in results.methods:
-            means = [found.mean if (found := _over_all(results, method, name, part)) else np.nan for part in PARTS]
-            if not np.isnan(means).all():
+            means = [summary(results.after(method, UNSEEN, name, share)) for share in shares]
+            if all(means):
                 colour, marker, line = style_of(method)
                 look = {"color": colour, "markerfacecolor": colour if line == "-" else "white", "linewidth": 1.5}
-                at = [100 * part for part in PARTS]
-                axes.plot(at, FIGURES[name].scale * np.array(means), marker + line, markersize=5, label=method, **look)
+                shown = [FIGURES[name].scale * mean.mean for mean in means if mean]
+                axes.plot([100 * share for share in shares], shown, marker + line, markersize=5, label=method, **look)
         axes.set(xlabel="share of the budget [%]", title=FIGURES[name].heading)
         axes.grid(alpha=0.3)
     legend(picture, panels)
@@ -76,19 +75,21 @@ def curves(results: Results) -> Drawn:
     return Drawn(picture, said + f"Whole budgets: {_budgets(results)} views.")
 
 
-def _over_all(results: Results, method: str, name: str, part: float) -> Summary | None:
-    return summary(results.after(method, UNSEEN, name, part))
+def _known(results: Results, role: str, name: str) -> list[float]:
+    """The shares after which a figure is known of every method that has it at all."""
+    having = [method for method in results.methods if results.after(method, role, name, 1.0)]
+    return [share for share in SHARES if having and all(results.after(one, role, name, share) for one in having)]
 
 
-def _in(results: Results, method: str, scene: str, part: float) -> Summary | None:
-    found = results.after(method, UNSEEN, "completion_ratio", part)
+def _in(results: Results, method: str, scene: str, share: float) -> Summary | None:
+    found = results.after(method, UNSEEN, "completion_ratio", share)
     return summary({key: value for key, value in found.items() if key[0] == scene})
 
 
-def _part(results: Results, part: float) -> str:
-    """Of a column: the number of views where all scenes have the same."""
-    budgets = {results.budget(scene["name"]) for scene in results.configuration["scenes"]}
-    return f"{100 * part:.0f} % of the views" if len(budgets) > 1 else f"{round(part * budgets.pop())} views"
+def _head(results: Results, share: float) -> str:
+    """Of a column: the number of views where all scenes have the same budget."""
+    budget = results.one_budget
+    return f"{100 * share:.0f} % of the views" if budget is None else f"{round(share * budget)} views"
 
 
 def _budgets(results: Results) -> str:

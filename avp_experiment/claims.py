@@ -75,8 +75,10 @@ def _below(found: Sequence[Sequence[Summary | None]]) -> str:
     both = "coverage and PSNR" if any(psnr for _, psnr in found) else "coverage"
     if any(one.mean <= 0 for one in differences):
         return f"**not** below every learned policy in {both}{missing}"
-    if all(one.interval[0] > 0 for one in differences):
-        return f"clearly below every learned policy in {both}: no interval reaches 0{missing}"
+    if known := [one for one in differences if not np.isnan(one.half_width)]:
+        few = "" if len(known) == len(differences) else f" ({len(differences) - len(known)} of one seed have none)"
+        if all(one.interval[0] > 0 for one in known):
+            return f"clearly below every learned policy in {both}: no interval reaches 0{few}{missing}"
     return f"below every learned policy in {both} on average, but not every difference has an interval above 0{missing}"
 
 
@@ -108,8 +110,8 @@ def _fewer_views_in(results: Results, role: str, less: str, more: str) -> str:
 def _holds(saved: Summary, difference: Summary) -> str:
     if saved.mean < FEWER_VIEWS or difference.mean < -WORSE_DB:
         return "**does not hold** (by the means)."
-    if np.isnan(saved.half_width):
-        return "**holds** (one seed: no interval)."
+    if np.isnan(saved.half_width) or np.isnan(difference.half_width):
+        return "**holds** by the means (of one seed: no interval)."
     if saved.interval[0] >= FEWER_VIEWS and difference.interval[0] >= -WORSE_DB:
         return "**holds**, also at the unfavourable ends of both intervals."
     return "**holds** by the means, not over the whole intervals."
@@ -137,9 +139,14 @@ def _compared(results: Results, left: str, right: str, role: str) -> list[str]:
     first, second = {key: first[key] for key in common}, {key: second[key] for key in common}
     head, rows = ["views", f"{left} − {right} [dB]", "episodes"], []
     # A number of views that only some episodes reach compares others than the rest of the table does.
-    for views in sorted(set.intersection(*(set(curve) for curve in (*first.values(), *second.values())))):
-        both = [{key: curve[views] for key, curve in curves.items()} for curves in (first, second)]
-        rows.append([str(views), _difference(statistics.paired(*both), "psnr"), str(len(common))])
+    placed = [
+        {key: {results.place(key, views): psnr for views, psnr in curve.items()} for key, curve in curves.items()}
+        for curves in (first, second)
+    ]
+    unit = "" if results.one_budget else " %"
+    for place in sorted(set.intersection(*(set(curve) for curves in placed for curve in curves.values()))):
+        both = [{key: curve[place] for key, curve in curves.items()} for curves in placed]
+        rows.append([f"{place:.0f}{unit}", _difference(statistics.paired(*both), "psnr"), str(len(common))])
     shorter = {key: min(max(first[key]), max(second[key])) for key in common}
     both = []
     for curves in (first, second):
@@ -185,7 +192,8 @@ def _views_needed(results: Results) -> list[str]:
             for figure, curves in (("PSNR", _curves), ("completion ratio", _completion)):
                 ours, theirs = (curves(results, method, role) for method in (OURS, other))
                 common = [key for key in ours if key in theirs]
-                if common:
+                # Of whole episodes alone there is nothing to say.
+                if common and any(len(ours[key]) > 1 for key in common):
                     ours, theirs = ({key: found[key] for key in common} for found in (ours, theirs))
                     lines.append(f"- {where.capitalize()}: {_equal(ours, theirs, OURS, other, figure)}")
     return ["\n".join(lines) or f"Nothing to compare: no episodes of `{OURS}` and another method in common."]

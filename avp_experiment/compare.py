@@ -181,8 +181,9 @@ def log_results(run: TrackedRun, experiment: str, results: Mapping[str, Any], fo
         child.metrics({f"eval/{name}": value for name, value in figures.items()}, 0)
         child.close("FINISHED")
     for prefix, seeds in by_method.items():
-        common = set.intersection(*map(set, seeds))
-        run.metrics({f"{prefix}/{name}": sum(one[name] for one in seeds) / len(seeds) for name in sorted(common)}, 0)
+        for name in sorted(set().union(*seeds)):
+            known = [one[name] for one in seeds if name in one]
+            run.metrics({f"{prefix}/{name}": sum(known) / len(known)}, 0)
     run.metrics({"failed_cells": float(len(results["failed"]))}, 0)
     run.flush()
     client = connect(run.address)

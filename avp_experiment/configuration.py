@@ -9,6 +9,7 @@ from typing import Any
 from avp_habitat import plugins
 from avp_habitat.errors import SceneError, UsageError, unknown_name
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
+from avp_habitat.task.budget import VIEWS_PER_M2
 from avp_habitat.task.rewards import REWARDS
 
 TRAIN, UNSEEN = "train", "unseen"
@@ -17,6 +18,8 @@ ROOMS = "_rooms"
 """A learned method whose name ends so is trained in generated rooms, never in the scenes of the experiment."""
 TUNED = "_tuned"
 """The weights of an exported policy whose name ends so are trained further in the scenes of the experiment."""
+LARGE_M2 = 30.0
+"""In a benchmark, scenes with more navigable floor get a budget by area."""
 _FIRST_ROOM = 100
 
 
@@ -104,8 +107,6 @@ class FixedScene:
 
     spec: str
     sha256: str
-    budget: int
-    """T there: most views of an episode."""
 
 
 @dataclass(frozen=True)
@@ -167,14 +168,14 @@ PRESETS = {
         trainings=3,
         size=(192, 144),
         iterations=500,
-        prefixes=(20, 40),
+        prefixes=(40,),
         methods=("heuristic", "random", "frontier", "greedy", "nbv", "survey", *_IN_ROOMS, "pretrained"),
         benchmark=True,
         fixed=(
-            FixedScene("builtin:100000", "ee50d313178757051cc1d6ff790e608a08a3e9286ae3984a278f5835b0ea292b", 80),
-            FixedScene("builtin:100001", "681cffbd90409622ef82962668bccd2da1d55fc81d29e143557b1d417b9abd9d", 80),
-            FixedScene("builtin-home:100000", "3b9143c7e53eb82b53636ce2ad158f46c692b35b6006e7d682e5c01e92f224b5", 196),
-            FixedScene("builtin-home:100001", "2f767ed80be0d3964437f7d8a018706f1c14d0f599a059c9ad1b7f447ea082f9", 173),
+            FixedScene("builtin:100000", "ee50d313178757051cc1d6ff790e608a08a3e9286ae3984a278f5835b0ea292b"),
+            FixedScene("builtin:100001", "681cffbd90409622ef82962668bccd2da1d55fc81d29e143557b1d417b9abd9d"),
+            FixedScene("builtin-home:100000", "3b9143c7e53eb82b53636ce2ad158f46c692b35b6006e7d682e5c01e92f224b5"),
+            FixedScene("builtin-home:100001", "2f767ed80be0d3964437f7d8a018706f1c14d0f599a059c9ad1b7f447ea082f9"),
         ),
         geometry_after=(40,),
         reconstructed=1,
@@ -282,7 +283,7 @@ def read_scenes(
     found: list[ExperimentScene] = []
     for role, specs in ((TRAIN, train), (UNSEEN, unseen)):
         for spec in specs:
-            scene = _scene(spec, role, choice, preset.budget, fixed.get(spec))
+            scene = _scene(spec, role, choice, preset, fixed.get(spec))
             for other in found:
                 if scene.sha256 == other.sha256 or scene_slug(scene.name) == scene_slug(other.name):
                     same = "the same scene as" if scene.sha256 == other.sha256 else "named as"
@@ -291,10 +292,15 @@ def read_scenes(
     return tuple(found)
 
 
-def _scene(spec: str, role: str, choice: SimulatorChoice, budget: int, fixed: FixedScene | None) -> ExperimentScene:
+def _scene(
+    spec: str, role: str, choice: SimulatorChoice, preset: ExperimentPreset, fixed: FixedScene | None
+) -> ExperimentScene:
+    budget = preset.budget
     opened = open_simulator(choice, spec)
-    _ = opened.area
-    scene = ExperimentScene(spec, opened.scene, opened.scene_digest, role, fixed.budget if fixed else budget)
+    area_m2 = opened.area.area_m2
+    if preset.benchmark and area_m2 > LARGE_M2:
+        budget = round(VIEWS_PER_M2 * area_m2)
+    scene = ExperimentScene(spec, opened.scene, opened.scene_digest, role, budget)
     opened.close()
     if fixed and scene.sha256 != fixed.sha256:
         wanted = f"expected the digest {fixed.sha256}, which the benchmark is made with"

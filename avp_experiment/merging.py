@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from avp_experiment.configuration import scene_slug
+from avp_experiment.configuration import known_methods, scene_slug
 from avp_experiment.folder import write_json
 from avp_experiment.results import (
     FILE,
@@ -72,7 +72,12 @@ class _Row:
         return all(one in self.entries[part] for part in PARTS for one in other.entries[part])
 
     def continues(self, other: "_Row") -> bool:
-        """Whether these are other episodes of the same policies by the same commits."""
+        """Whether these are other episodes of the same policies by the same commits.
+
+        Of weights and classes of users the name says nothing.
+        """
+        if self.method not in known_methods():
+            return False
         trained = {one["seed"]: one for one in other.entries["training"]}
         same_policies = all(trained.get(one["seed"], one) == one for one in self.entries["training"])
         commits = commits_of(self.entries)
@@ -99,7 +104,7 @@ def merge(folders: Sequence[Path], out: Path) -> Merged:
     configuration, figures = _configuration(several), _figures(several)
     origins, failed, rows = _measured(several, values)
     named: dict[str, _Row] = {}
-    for row in rows:
+    for row in _joined(rows):
         named[f"{row.method} ({row.labels[0]})" if row.method in named else row.method] = row
     content = {
         "format": FORMAT,
@@ -133,7 +138,7 @@ def _measured(
             origins[labels[label]] = origin
         failed += [{**one, "label": labels[one.get("label", next(iter(labels)))]} for one in results.failed]
         for method in results.methods:
-            _add(rows, _row(results, value, method, labels))
+            rows.append(_row(results, value, method, labels))
     return origins, failed, rows
 
 
@@ -154,8 +159,8 @@ def _configuration(several: Sequence[Results]) -> dict[str, Any]:
     for results in several[1:]:
         told = _differences(first, first.configuration, results, results.configuration, skipped=_MAY_DIFFER)
         if told:
-            versions = first.configuration.get("preset") != results.configuration.get("preset")
-            what = "versions of a benchmark" if versions else "settings"
+            other = first.configuration.get("preset") != results.configuration.get("preset")
+            what = "presets or versions of a benchmark" if other else "settings"
             raise UsageError(f"{told}: results of different {what} cannot be merged")
     for name in ("rooms", "metrics"):
         if union := dict.fromkeys(one for results in several for one in results.configuration.get(name, ())):
@@ -230,13 +235,20 @@ def _pictures(results: Results, shown: str) -> dict[tuple[str, str], Path]:
     return found
 
 
-def _add(rows: list[_Row], new: _Row) -> None:
-    """Add what a folder found of a method: nothing new, more of a row, or a row of its own."""
-    same = [row for row in rows if row.method == new.method]
-    if any(row.holds(new) for row in same):
-        return
-    for row in same:
-        if new.holds(row) or new.continues(row):
-            row.add(new)
-            return
-    rows.append(new)
+def _joined(rows: Sequence[_Row]) -> list[_Row]:
+    """Rows of which others hold all, or that are empty beside others, are dropped; parts of one become one."""
+    kept = [row for number, row in enumerate(rows) if not _needless(row, rows[:number], rows[number + 1 :])]
+    found: list[_Row] = []
+    for row in kept:
+        whole = next((one for one in found if one.method == row.method and row.continues(one)), None)
+        if whole is None:
+            found.append(row)
+        else:
+            whole.add(row)
+    return found
+
+
+def _needless(row: _Row, before: Sequence[_Row], after: Sequence[_Row]) -> bool:
+    same, later = ([one for one in rows if one.method == row.method] for rows in (before, after))
+    # Of equal ones the first is kept.
+    return any(one.holds(row) for one in same) or any(one.holds(row) and not row.holds(one) for one in later)

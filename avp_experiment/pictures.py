@@ -30,7 +30,7 @@ _UNSEEN_COLOUR, _PATH_COLOUR = "#C9CCD2", "#B22234"
 
 def maps(results: Results, methods: Sequence[str] = ()) -> Drawn:
     """Figure 5: episodes from above, a row for the first scene of training and one for the first unseen one."""
-    methods = methods or [method for method in MAPS if method in results.methods][:3]
+    methods = methods or ([method for method in MAPS if method in results.methods] or results.methods)[:3]
     drawn = {(one.method, one.key[0]): one for one in results.rollouts if one.floor is not None}
     scenes = [names[0] for role in (TRAIN, UNSEEN) if (names := results.scenes(role))]
     scenes = [scene for scene in scenes if any((method, scene) in drawn for method in methods)]

@@ -61,13 +61,16 @@ _STYLES = {
     "survey-multiview": ("#332288", "d"),
     "pretrained": ("#C1121F", "*"),
 }
-_OTHER = ("#A08060", "8")
+_OTHERS = [(colour, marker) for marker in "8dp<" for colour in ("#A08060", "#44AA99", "#882255", "#6699CC")]
+"""Of methods of others, in the order in which they are first drawn."""
 
 
 def style_of(method: str) -> tuple[str, str, str]:
     """Colour, marker and line of a method; in rooms, tuned, or another's of merged results: those of it, dashed."""
     plain = without_label(method).removesuffix(ROOMS).removesuffix(TUNED)
-    return *_STYLES.get(plain, _OTHER), "-" if plain == method else "--"
+    if plain not in _STYLES:
+        _STYLES[plain] = _OTHERS[len(_STYLES) % len(_OTHERS)]
+    return *_STYLES[plain], "-" if plain == method else "--"
 
 
 def new_figure(height_in: float) -> "Figure":
@@ -126,7 +129,8 @@ def psnr_by_views(results: Results) -> Drawn:
     for axes, role in zip(panels, roles, strict=True):
         for method in results.methods:
             _psnr_curve(axes, method, _psnr_points(results, method, role))
-        axes.set(xlabel="views (frames used)", ylabel="PSNR on held-out views [dB]")
+        used = "views (frames used)" if results.one_budget else "views (frames used) [% of the budget]"
+        axes.set(xlabel=used, ylabel="PSNR on held-out views [dB]")
         axes.set_title(f"{_ROLES[role]}: {', '.join(results.scenes(role))}", fontsize=10)
         axes.grid(alpha=0.3)
     legend(picture, panels)
@@ -198,17 +202,19 @@ def _training_curve(axes: "Axes", method: str, trainings: Sequence[Training], me
 
 
 def _psnr_points(results: Results, method: str, role: str) -> list[tuple[float, dict[Key, float]]]:
-    """Number of views, and PSNR by episode: of the first frames where all episodes have so many, and of all frames."""
+    """Place on the axis (`results.place`), and PSNR by episode: of first frames that all episodes have, and of all."""
     episodes = results.reconstruction_curves(method, role)
     scored = [(key, one) for key, curve in episodes.items() for one in curve.values() if "psnr" in one.scores]
     points = []
-    for views in sorted({one.frames for _, one in scored if not one.whole}):
-        first = {key: one.scores["psnr"] for key, one in scored if not one.whole and one.frames == views}
+    for place in sorted({results.place(key, one.frames) for key, one in scored if not one.whole}):
+        first = {
+            key: one.scores["psnr"] for key, one in scored if not one.whole and results.place(key, one.frames) == place
+        }
         if len(first) == len(episodes):
-            points.append((float(views), first))
+            points.append((place, first))
     if whole := {key: one for key, one in scored if one.whole}:
-        views = float(np.mean([one.frames for one in whole.values()]))
-        points.append((views, {key: one.scores["psnr"] for key, one in whole.items()}))
+        place = float(np.mean([results.place(key, one.frames) for key, one in whole.items()]))
+        points.append((place, {key: one.scores["psnr"] for key, one in whole.items()}))
     return points
 
 

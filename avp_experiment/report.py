@@ -146,14 +146,12 @@ def _write_csv(path: Path, rows: Rows, shown: Sequence[Figure], episodes: Mappin
 def _notes(results: Results, role: str, found: Mapping[str, Mapping[str, Mapping[Key, float]]]) -> list[str]:
     missing = [method for method in results.methods if method not in found]
     notes = [f"No episode of {', '.join(missing)}."] if missing else []
-    most = max(len(episodes) for known in found.values() for episodes in known.values())
-    fewer = [
-        f"{method} {len(values['coverage'])} episodes, {len(values['psnr'])} reconstructions"
-        for method, values in found.items()
-        if values.get("psnr") and min(len(values["coverage"]), len(values["psnr"])) < most
-    ]
-    if fewer:
-        notes.append(f"Of fewer than {most} episodes or reconstructions: {'; '.join(fewer)}.")
+    for name, what in (("coverage", "episodes"), ("psnr", "reconstructions"), ("completion_ratio", "shapes")):
+        counts = {method: len(values[name]) for method, values in found.items() if values.get(name)}
+        most = max(counts.values(), default=0)
+        if fewer := [f"{method} {count}" for method, count in counts.items() if count < most]:
+            notes.append(f"Of fewer than {most} {what}: {', '.join(fewer)}.")
+    notes += results.unvisited(role)
     if role == TRAIN and any(without_label(method).endswith(ROOMS) for method in found):
         notes.append(f"Methods whose name ends in `{ROOMS}` were trained in generated rooms, never in these scenes.")
     return notes

@@ -120,19 +120,43 @@ class Results:
         return {one.key: one.geometry[name] for one in found if name in one.geometry}
 
     def after(self, method: str, role: str, name: str, share: float) -> dict[Key, float]:
-        """A figure by episode after a share of the budget; an episode that has ended by then counts with all it had."""
+        """A figure by episode after a share of the budget; an episode that has ended by then counts with all it had.
+
+        Nothing where it is not known of all: those that have ended are not like the others.
+        """
+        of = [one for one in self.rollouts if (one.method, one.role) == (method, role) and one.curves.get(name)]
         found = {}
-        for one in self.rollouts:
-            if (one.method, one.role) == (method, role) and (curve := one.curves.get(name)):
-                views = min(round(share * self.budget(one.key[0])), max(curve))
-                if views in curve:
-                    found[one.key] = curve[views]
-        return found
+        for one in of:
+            curve = one.curves[name]
+            views = min(round(share * self.budget(one.key[0])), max(curve))
+            if views in curve:
+                found[one.key] = curve[views]
+        return found if len(found) == len(of) else {}
 
     def budget(self, scene: str) -> int:
         """Most views of an episode in a scene."""
         budgets = (one.get("budget") for one in self.configuration["scenes"] if one["name"] == scene)
         return next(budgets, None) or self.configuration["budget"]
+
+    @property
+    def one_budget(self) -> int | None:
+        """That of all scenes, if they have the same."""
+        budgets = {self.budget(scene["name"]) for scene in self.configuration["scenes"]}
+        return budgets.pop() if len(budgets) == 1 else None
+
+    def place(self, key: Key, views: int) -> float:
+        """A number of views of an episode on an axis: itself, or where budgets differ percent of the scene's."""
+        return float(views if self.one_budget else round(100 * views / self.budget(key[0])))
+
+    def unvisited(self, role: str) -> list[str]:
+        """A note for each method that lacks scenes of a role in which it has any episode: its means are of others."""
+        notes = []
+        for method in self.methods:
+            visited = {one.key[0] for one in self.rollouts if (one.method, one.role) == (method, role)}
+            lacking = [scene for scene in self.scenes(role) if scene not in visited]
+            if visited and lacking:
+                notes.append(f"{method}: without {', '.join(lacking)}, so that its means are of other scenes.")
+        return notes
 
     def reconstruction_curves(self, method: str, role: str) -> dict[Key, dict[int, Reconstruction]]:
         """By episode its reconstructions by number of frames, ascending; of episodes that have several, if any has."""
@@ -173,7 +197,7 @@ def as_results(folder: Path, value: dict[str, Any]) -> Results:
     """Check and convert the content of a folder's `results.json`; an `AVPError` where that is damaged."""
     try:
         for scene in value["configuration"]["scenes"]:
-            _ = scene["name"], scene["sha256"], scene["role"]
+            _ = scene["name"], scene["sha256"], scene["role"], value["configuration"]["budget"]
         # Only merged results have several.
         origins = value["origins"] if "origins" in value else {folder.resolve().name: value["origin"]}
         return Results(
@@ -234,11 +258,11 @@ def _episode(entry: Any) -> EpisodeResult:
         entry.get("map") and {**entry["map"], "numbers": floor_of(entry["map"])},
     )
     # Results of before have none of parallax and geometry.
-    known = {name: entry.get(f"{key}_curve", ()) for name, key in _CURVES.items()}
+    known = {name: entry.get(f"{key}_curve") or () for name, key in _CURVES.items()}
     curves = {name: {i: float(share) for i, share in enumerate(curve, 1)} for name, curve in known.items() if curve}
-    for views, found in entry.get("geometry_after", {}).items():
-        for name in found:
-            curves.setdefault(name, {})[int(views)] = float(found[name])
+    for views, found in (entry.get("geometry_after") or {}).items():
+        for name, value in _numbers(found).items():
+            curves.setdefault(name, {})[int(views)] = value
     for name in GEOMETRY:
         if name in metrics:
             curves.setdefault(name, {})[round(metrics["views"])] = metrics[name]
@@ -253,6 +277,6 @@ def _reconstruction(entry: Any) -> Reconstruction:
         whole=bool(entry["whole"]),
         scores=_numbers(entry["scores"]),
         lpips_reason=entry.get("lpips_reason"),
-        geometry=_numbers(entry.get("geometry", {})),
+        geometry=_numbers(entry.get("geometry") or {}),
         psnr_by_view=tuple(view.get("psnr") for view in entry["per_view"]),
     )

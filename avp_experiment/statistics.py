@@ -1,7 +1,7 @@
 """Means over seeds, differences between methods, and how well what the frames have seen predicts the reconstruction."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,8 @@ NOTHING = "–"
 """What tables show where there is no figure."""
 PREDICTORS = ("visibility", "visibility_parallax", "completion_ratio", "coverage")
 """What may predict PSNR."""
+_NEARLY_ALL = 0.9
+"""A predictor that fewer of the reconstructions have is left out, not the reconstructions."""
 RESAMPLES = 2000
 _BOOTSTRAP_SEED = 0
 
@@ -57,9 +59,11 @@ class Correlation:
 
 
 def per_seed(values: Mapping[Key, float]) -> dict[int, float]:
-    """Means over scenes and starts by seed, in the seeds' order."""
-    seeds = sorted({seed for _, seed, _ in values})
-    return {seed: float(np.mean([value for key, value in values.items() if key[1] == seed])) for seed in seeds}
+    """Means over scenes, of the means over starts, by seed, in the seeds' order."""
+    found: dict[int, dict[str, list[float]]] = {}
+    for (scene, seed, _), value in sorted(values.items()):
+        found.setdefault(seed, {}).setdefault(scene, []).append(value)
+    return {seed: float(np.mean([np.mean(of) for of in scenes.values()])) for seed, scenes in sorted(found.items())}
 
 
 def summary(values: Mapping[Key, float]) -> Summary | None:
@@ -155,7 +159,7 @@ class Point:
 
 
 def points_of(results: Results) -> list[Point]:
-    """All reconstructions of which a PSNR and every predictor that any has are known, so that these compare."""
+    """All reconstructions with a PSNR and those predictors that nearly all of them have, so that these compare."""
     curves = {(one.method, *one.key): one.curves for one in results.rollouts}
     points = []
     for one in results.reconstructions:
@@ -164,8 +168,12 @@ def points_of(results: Results) -> list[Point]:
         shares = {name: curve[one.frames] for name, curve in known.items() if one.frames in curve}
         if shares and "psnr" in one.scores:
             points.append(Point(one.method, rollout, one.whole, shares, one.scores["psnr"]))
-    known = {name for point in points for name in point.shares}
-    return [point for point in points if known <= set(point.shares)]
+    kept = {name for name in PREDICTORS if sum(name in one.shares for one in points) >= _NEARLY_ALL * len(points)}
+    return [
+        replace(point, shares={name: point.shares[name] for name in PREDICTORS if name in kept})
+        for point in points
+        if kept and kept <= set(point.shares)
+    ]
 
 
 def correlations(points: Sequence[Point], name: str) -> dict[str, Correlation | None]:

@@ -71,7 +71,8 @@ class Collect:
     height: Annotated[int, Range(8, 8192)] = 480
     """Of the pictures in pixels."""
     heldout: HeldoutKind = "standard"
-    """Held-out views: with pitches up to 20 degrees, or up to 45 degrees where the navigable area can show all."""
+    """Held-out views: standard, pitched by up to 20 degrees; observable, by up to 45, where what they show can be seen
+    from elsewhere too."""
     geometry: bool = False
     """Also measure how true the fused depth is (accuracy, completion …); takes ten seconds or more."""
     geometry_after: tuple[int, ...] = ()

@@ -3,8 +3,10 @@
 import json
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+import yaml
 
 from avp_experiment import compare, configuration
 from avp_experiment.cells import COLLECT, RECONSTRUCT, TRAIN, plan
@@ -58,8 +60,8 @@ def test_places_of_later_seeds_get_the_policies_of_the_first_in_turn(benchmark, 
 
 def test_each_scene_has_its_budget_and_geometry_after_half_of_it(benchmark, tmp_path):
     cells = [cell for cell in plan(benchmark, tmp_path, tracking="avp") if cell.kind == COLLECT]
-    budgets = {scene.spec: scene.budget for scene in V1.fixed} | {"builtin:7": 80}
-    assert max(budgets.values()) > 80
+    # 61.2 and 54.0 m² of floor.
+    budgets = dict.fromkeys([*FIXED, "builtin:7"], 80) | {"builtin-home:100000": 196, "builtin-home:100001": 173}
     for cell in cells:
         budget = budgets[cell.scene.spec]
         assert option(cell, "--budget") == str(budget)
@@ -93,7 +95,7 @@ def test_what_was_known_of_presets_is_written_as_before_and_what_is_new_is_added
 
 
 def test_a_generated_scene_that_came_out_otherwise_is_refused(monkeypatch, capsys):
-    other = replace(V1, fixed=(FixedScene("builtin:3", "00ff", 80),))
+    other = replace(V1, fixed=(FixedScene("builtin:3", "00ff"),))
     monkeypatch.setitem(configuration.PRESETS, "benchmark-v1", other)
     assert command.run(compare.main, ["--preset", "benchmark-v1"]) == 1
     assert "builtin:3: expected the digest 00ff, which the benchmark is made with, found" in capsys.readouterr().err
@@ -118,3 +120,10 @@ def test_what_would_be_another_benchmark_is_refused(tmp_path, monkeypatch, capsy
 def test_a_benchmark_without_any_scene_is_refused(capsys):
     assert command.run(compare.main, ["--preset", "benchmark-v1-full"]) == 2
     assert "unseen: expected at least one scene, got none" in capsys.readouterr().err
+
+
+def test_mlflow_projects_leaves_the_scenes_to_the_preset():
+    project = yaml.safe_load((Path(__file__).parent.parent / "MLproject").read_text())
+    parameters = project["entry_points"]["compare"]["parameters"]
+    given = {name: parameters[name]["default"] for name in ("scene", "unseen")}
+    assert compare.Compare(preset="benchmark-v1", methods="nbv", **given).configuration().scenes[-1].spec == FIXED[-1]

@@ -162,7 +162,9 @@ REFUSED = {
     "another version": (
         results_of("heuristic", preset="benchmark-v1"),
         results_of("greedy", preset="benchmark-v2"),
-        ["benchmark-v1 in a, benchmark-v2 in b: results of different versions of a benchmark cannot be merged"],
+        [
+            "benchmark-v1 in a, benchmark-v2 in b: results of different presets or versions of a benchmark cannot be merged"
+        ],
     ),
     "other settings": (
         results_of("heuristic"),
@@ -263,3 +265,35 @@ def test_an_unknown_method_of_the_maps_is_told_before_anything_is_written(merge,
     assert command.run(main, ["a", "--out", "n", "--maps", "heuristik"]) == 2
     assert "did you mean 'heuristic'?" in capsys.readouterr().err
     assert not (tmp_path / "n").exists()
+
+
+def both_starts(commit="0123456789abcdef"):
+    """An experiment that was gone on with: the episodes of `results_of` and those of `started_later`."""
+    first, later = results_of("heuristic"), started_later(results_of("heuristic", commit=commit))
+    for part in ("rollouts", "reconstructions"):
+        first[part] += later[part]
+    first["configuration"]["starts"] = 2
+    return first
+
+
+@pytest.mark.parametrize("order", ["early later both", "both early later", "later both early"])
+def test_what_one_result_holds_of_another_is_kept_once_in_any_order(merge, order):
+    known = {
+        "early": results_of("heuristic"),
+        "later": started_later(results_of("heuristic", commit="fedcba9876543210")),
+        "both": both_starts(commit="fedcba9876543210"),
+    }
+    assert merge(**{name: known[name] for name in order.split()}) == 0
+    assert merged()["methods"] == ["heuristic"]
+    assert len(merged()["rollouts"]) == 4
+
+
+def test_weights_of_two_people_in_folders_of_one_name_are_two_rows(merge):
+    a, b = results_of("heuristic"), started_later(results_of("heuristic", person="b"))
+    for results in (a, b):
+        results["methods"] = ["runs.weights"]
+        for part in ("rollouts", "reconstructions"):
+            for one in results[part]:
+                one["method"] = "runs.weights"
+    assert merge(a=a, b=b) == 0
+    assert merged()["methods"] == ["runs.weights", "runs.weights (b)"]

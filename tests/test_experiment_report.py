@@ -288,7 +288,10 @@ def incomplete(folder, drop):
 TABLES = {
     "no reconstruction": (without("reconstructions"), "No PSNR [dB]: no whole episode was reconstructed"),
     "no proposed": (without("rollouts", method="proposed"), "No episode of proposed."),
-    "a seed less": (without("reconstructions", method="surface", seed=1), "Of fewer than 3 episodes"),
+    "a seed less": (
+        without("reconstructions", method="surface", seed=1),
+        "Of fewer than 3 reconstructions: surface 2.",
+    ),
     "no whole ones": (without("reconstructions", whole=True), "no whole episode was reconstructed"),
 }
 
@@ -433,3 +436,51 @@ def test_a_folder_that_is_none_is_refused_by_the_function_too(tmp_path):
     (tmp_path / "results.json").mkdir()
     with pytest.raises(AVPError):
         read_results(tmp_path)
+
+
+def test_geometry_after_a_part_is_not_told_of_those_alone_that_have_ended(report):
+    results = make_results(("greedy", "proposed"))
+    for one in results["rollouts"]:
+        one["geometry_after"] = {key: value for key, value in one["geometry_after"].items() if key == "40"}
+    page = (report(results) / "results.md").read_text()
+    lines = page.partition("completion ratio [%], unseen scenes:")[2].splitlines()
+    assert [cell.strip() for cell in lines[2].strip("|").split("|")] == ["method", "40 views", "80 views"]
+
+
+def test_a_predictor_that_few_have_is_left_out_and_not_the_reconstructions(report):
+    results = make_results(FEW, scenes=TRAIN_ONLY)
+    for one in results["rollouts"]:
+        one["geometry_after"] = None
+    said = section(report(results), "What predicts PSNR")
+    assert "completion ratio" not in said
+    assert f" {len(results['reconstructions'])} |" in said
+
+
+def test_a_method_without_a_scene_is_told_and_scenes_count_alike(report):
+    results = make_results(("greedy", "proposed"), seeds=2)
+    gone = {"method": "greedy", "scene": "grey.glb"}
+    for part in ("rollouts", "reconstructions"):
+        results[part] = [one for one in results[part] if any(one[name] != value for name, value in gone.items())]
+    results["configuration"]["scenes"][0] = {**results["configuration"]["scenes"][0], "role": "unseen"}
+    for part in ("rollouts", "reconstructions"):
+        for one in results[part]:
+            one["role"] = "unseen"
+    folder = report(results)
+    assert "greedy: without grey.glb, so that its means are of other scenes." in (folder / "table3.md").read_text()
+
+
+def test_parts_of_different_budgets_stand_at_the_same_place(tmp_path):
+    results = make_results(("greedy",), seeds=2, starts=1, prefixes=(40,))
+    scenes = [{**scene, "role": "unseen"} for scene in SCENES]
+    scenes[1]["budget"] = 160
+    results["configuration"]["scenes"] = scenes
+    for part in ("rollouts", "reconstructions"):
+        for one in results[part]:
+            one["role"] = "unseen"
+    for one in results["reconstructions"]:
+        if one["scene"] == "grey.glb":
+            one["views"] = 160
+            one["frames"] = 160 if one["whole"] else 80
+    found = read_results(write_results(tmp_path, results))
+    axes = plots.psnr_by_views(found).picture.axes[0]
+    assert axes.lines[0].get_xdata().tolist() == [50.0, 100.0]

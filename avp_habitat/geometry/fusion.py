@@ -14,8 +14,8 @@ VOXEL_M = 0.0125
 TRUNCATION_M = 0.04
 """Distances to the surface are known up to this, metres. More of it lets silhouettes leave more false surface."""
 _BLOCK, _BLOCKS, _STRIDE = 8, 20_000, 4
-_ORDER = np.array([1.0, np.sqrt(2), np.pi], np.float32)
-"""A direction along which no two triangles lie alike."""
+_ORDER = np.array([1.0, np.sqrt(2), np.pi])
+"""A direction along which no two triangles of a grid lie alike, in float64."""
 
 
 class Fusion:
@@ -73,7 +73,7 @@ class Fusion:
         if not len(triangles):
             return None
         # Open3D's threads give them in any order, and samples of the surface depend on it.
-        place = (vertices @ _ORDER)[triangles].sum(axis=1)
+        place = (vertices.astype(np.float64) @ _ORDER)[triangles].sum(axis=1)
         return Shape(vertices, triangles[np.argsort(place, kind="stable")])
 
     def _camera(self, by: int) -> Any:

@@ -58,7 +58,7 @@ def heldout_poses(simulator: Simulator, *, sensor_height_m: float, views: int = 
 def observable_poses(simulator: Simulator, settings: TaskSettings, *, views: int = VIEWS) -> NDArray[np.float64]:
     """The same with pitches within ±45°, of views whose pixels the navigable area can show.
 
-    Of a view `SHOWN` of the pixels show a surface that the task's camera sees from `LEAST_SHARE` of the lookouts.
+    Of a view `SHOWN` of the pixels show a surface that the task's camera sees from `lookouts_needed` of the lookouts.
 
     Raises:
         SceneError: the scene is too narrow for such views.
@@ -75,7 +75,8 @@ def observable_poses(simulator: Simulator, settings: TaskSettings, *, views: int
         pairs = np.argwhere(within)
         seen = reached_around(simulator, eyes, points, pairs, tolerance_m=settings.tolerance_m)
         times = np.bincount(pairs[seen, 1], minlength=len(points))
-        return bool((times >= LEAST_SHARE * len(eyes)).mean() >= SHOWN) if len(points) else False
+        # Pixels that show no surface count, and are not shown from anywhere.
+        return bool((times >= lookouts_needed(len(eyes))).sum() >= SHOWN * depth[::_STRIDE, ::_STRIDE].size)
 
     drawn = _drawn(simulator, rng, settings.sensor_height_m, OBSERVABLE_PITCH_DEG)
     chosen = (pose for pose, depth in drawn if shown(pose, depth))
@@ -94,6 +95,11 @@ def lookouts(simulator: Simulator, settings: TaskSettings, places: int = PLACES)
     centres = simulator.area.centres
     feet = centres[np.unique(np.linspace(0, len(centres) - 1, places).astype(int))]
     return feet + [0.0, settings.sensor_height_m, 0.0]
+
+
+def lookouts_needed(count: int) -> int:
+    """From so many of `count` lookouts an observable point is seen."""
+    return max(1, round(LEAST_SHARE * count))
 
 
 def steepest_elevation(settings: TaskSettings) -> float:
