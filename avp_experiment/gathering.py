@@ -10,12 +10,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 from avp_experiment.cells import COLLECT, RECONSTRUCT, Cell, floor_map
 from avp_experiment.configuration import Configuration, scene_slug
 from avp_experiment.folder import Folder, write_json
 from avp_experiment.results import FILE, FORMAT, PARTS, PICTURES
 from avp_habitat.metrics import FIGURES, figures
 from avp_habitat.provenance import PACKAGES, installed_versions
+
+_WIDEST = 240
+"""Pixels; figure 6 shows six pictures beside each other."""
 
 
 def gather(configuration: Configuration, folder: Folder, cells: Sequence[Cell], *, command: str) -> dict[str, Any]:
@@ -101,4 +106,15 @@ def _copy_pictures(cell: Cell, root: Path) -> None:
         kind, _, number = path.stem.partition("_")
         shown = "truth" if kind == "truth" else cell.method.name
         (root / PICTURES).mkdir(exist_ok=True)
-        shutil.copyfile(path, root / PICTURES / f"{scene_slug(cell.scene.name)}-{shown}-{int(number):02d}.png")
+        _copy_small(path, root / PICTURES / f"{scene_slug(cell.scene.name)}-{shown}-{int(number):02d}.png")
+
+
+def _copy_small(path: Path, out: Path) -> None:
+    """Copy a picture, no wider than `_WIDEST`, so that results can be kept beside code."""
+    with Image.open(path) as picture:
+        if picture.width <= _WIDEST:
+            shutil.copyfile(path, out)
+            return
+        size = _WIDEST, round(picture.height * _WIDEST / picture.width)
+        small = picture.convert("RGB").resize(size, Image.Resampling.LANCZOS)
+        small.quantize(256, dither=Image.Dither.NONE).save(out, optimize=True)
