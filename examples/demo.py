@@ -45,7 +45,7 @@ class Demo:
     def configuration(self) -> Configuration:
         """As an experiment without unseen scenes."""
         preset = replace(PRESET, steps=self.steps, iterations=self.iterations, size=(self.width, self.height))
-        scenes = read_scenes([self.scene], [], SimulatorChoice())
+        scenes = read_scenes([self.scene], [], SimulatorChoice(), preset)
         return Configuration("demo", preset, scenes, chosen_methods(METHODS))
 
 
