@@ -1,8 +1,10 @@
 """What methods know after parts of the budget: tables of a figure by part and by scene, and its curves."""
 
+from functools import partial
+
 from avp_experiment.configuration import TRAIN, UNSEEN
 from avp_experiment.plots import Drawn, Missing, legend, new_figure, style_of
-from avp_experiment.results import Results
+from avp_experiment.results import Key, Results
 from avp_experiment.statistics import NOTHING, Summary, summary
 from avp_habitat.metrics import FIGURES
 from avp_habitat.tables import table
@@ -37,20 +39,35 @@ def by_budget(results: Results) -> str:
 
 
 def by_scene(results: Results) -> str:
-    """Completion ratio in each unseen scene, after half and after all of the budget.
+    """In each unseen scene: completion ratio of the captured depth after half and all of the budget, and PSNR.
 
     Raises:
-        Missing: it is not known.
+        Missing: neither is known.
     """
     scenes, parts = results.scenes(UNSEEN), []
-    for part in (0.5, 1.0):
-        rows = {method: [_in(results, method, scene, part) for scene in scenes] for method in results.methods}
+    for title, name, find in (
+        ("completion ratio [%] after half of the budget", "completion_ratio", partial(_after, share=0.5)),
+        ("completion ratio [%] after all of it", "completion_ratio", partial(_after, share=1.0)),
+        ("PSNR [dB] of reconstructions from all views", "psnr", _psnr),
+    ):
+        rows = {method: [summary(_of(scene, find(results, method))) for scene in scenes] for method in results.methods}
         if any(map(any, rows.values())):
-            head = "half of the budget" if part < 1 else "all of it"
-            parts.append(f"After {head}:\n\n{_table(scenes, rows, 'completion_ratio')}")
+            parts.append(f"{title}:\n\n{_table(scenes, rows, name)}")
     if not parts:
-        raise Missing("no completion ratio is known")
+        raise Missing("neither completion ratio nor PSNR is known")
     return "\n\n".join(parts)
+
+
+def _after(results: Results, method: str, *, share: float) -> dict[Key, float]:
+    return results.after(method, UNSEEN, "completion_ratio", share)
+
+
+def _psnr(results: Results, method: str) -> dict[Key, float]:
+    return results.values(method, UNSEEN, "psnr")
+
+
+def _of(scene: str, values: dict[Key, float]) -> dict[Key, float]:
+    return {key: value for key, value in values.items() if key[0] == scene}
 
 
 def curves(results: Results) -> Drawn:
@@ -79,11 +96,6 @@ def _known(results: Results, role: str, name: str) -> list[float]:
     """The shares after which a figure is known of every method that has it at all."""
     having = [method for method in results.methods if results.after(method, role, name, 1.0)]
     return [share for share in SHARES if having and all(results.after(one, role, name, share) for one in having)]
-
-
-def _in(results: Results, method: str, scene: str, share: float) -> Summary | None:
-    found = results.after(method, UNSEEN, "completion_ratio", share)
-    return summary({key: value for key, value in found.items() if key[0] == scene})
 
 
 def _head(results: Results, share: float) -> str:

@@ -37,7 +37,7 @@ _TABLES = {
 }
 _PARTS = {
     "by_budget": ("By part of the budget", budgets.by_budget),
-    "by_scene": ("Completion ratio by scene", budgets.by_scene),
+    "by_scene": ("By scene", budgets.by_scene),
 }
 """Tables that the page alone holds."""
 Values = Callable[[Results, str, str, str], Mapping[Key, float]]

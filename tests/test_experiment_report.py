@@ -484,3 +484,17 @@ def test_parts_of_different_budgets_stand_at_the_same_place(tmp_path):
     found = read_results(write_results(tmp_path, results))
     axes = plots.psnr_by_views(found).picture.axes[0]
     assert axes.lines[0].get_xdata().tolist() == [50.0, 100.0]
+
+
+def test_each_unseen_scene_has_its_own_completion_ratio_and_psnr(report):
+    results = make_results(FEW)
+    page = (report(results) / "results.md").read_text().partition("## By scene")[2]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in page.splitlines() if "|" in line]
+    for part, value in (
+        ("rollouts", lambda one: 100 * one["metrics"]["completion_ratio"]),
+        ("reconstructions", lambda one: one["scores"]["psnr"]),
+    ):
+        whole = {"whole": True} if part == "reconstructions" else {}
+        mean, half = interval(by_seed(results[part], value, method="proposed", scene="grey.glb", **whole))
+        digits = 1 if part == "rollouts" else 2
+        assert ["proposed", f"{mean:.{digits}f} ± {half:.{digits}f}"] in rows
