@@ -13,7 +13,7 @@ from avp_experiment.runner import Runner, environment
 
 def rollouts(root):
     preset = replace(PRESETS["smoke"], budget=3, size=(32, 24), starts=3, prefixes=())
-    scenes = (ExperimentScene("builtin:0", "builtin:0", "00", "train"),)
+    scenes = (ExperimentScene("builtin:0", "builtin:0", "00", "train", preset.budget),)
     configuration = Configuration("smoke", preset, scenes, chosen_methods(["heuristic", "random"]))
     return [cell for cell in plan(configuration, root, tracking="avp") if cell.kind == COLLECT]
 
