@@ -2,6 +2,7 @@
 
 import atexit
 import functools
+import os
 import shlex
 import shutil
 import socket
@@ -28,6 +29,7 @@ from avp_sb3.rerun.episode import episode_of, log_episode, metric_path
 from avp_sb3.rerun.layout import eye_above, training_blueprint
 from avp_sb3.rerun.room import RecordedEnvironments, log_room
 
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 _FLUSH_S = 5.0
 _LEAST_FREE = 100_000_000
 _LOOPBACK = "127.0.0.1"
@@ -277,6 +279,9 @@ def _live_recording(target: str, identity: str, layout: rr.blueprint.Blueprint) 
             recording.set_sinks(data, default_blueprint=layout)
             print(f"Rerun web viewer: {_web_page()}/?url={quote(data.uri, safe='')}", flush=True)
         elif target == "viewer":
+            # It ends only after it has taken the first data, on a busy machine also after they are flushed.
+            if sys.platform == "linux" and not any(os.environ.get(name) for name in _DISPLAYS):
+                raise RuntimeError(f"none of {', '.join(_DISPLAYS)} is set")
             program = Path(sysconfig.get_path("scripts")) / "rerun"
             rr.spawn(recording=recording, default_blueprint=layout, executable_path=str(program))
         else:
