@@ -138,7 +138,7 @@ class _Planner:
         words += ["--out", self._out(RECONSTRUCT, name), "--method", preset.reconstruction]
         words += ["--iterations", str(preset.iterations)]
         words += ["--frames", str(frames)] if frames is not None else []
-        if preset.model_geometry:
+        if preset.model_geometry and frames is None:
             words += ["--scene", scene.spec, *self.configuration.simulator_options]
         if frames is None and of.seed == 0 and of.start == 0:
             words += ["--pictures", *map(str, preset.heldout_pictures)]

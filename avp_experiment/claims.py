@@ -84,10 +84,8 @@ def _below(found: Sequence[Sequence[Summary | None]]) -> str:
 
 def _fewer_views(results: Results) -> list[str]:
     lines = []
-    for ending in ("", ROOMS) if f"proposed{ROOMS}" in results.methods else ("",):
-        both = (f"proposed{ending}", f"coverage{ending}")
-        if ending and not set(both) <= set(results.methods):
-            continue
+    pairs = [(f"proposed{ending}", f"coverage{ending}") for ending in ("", ROOMS)]
+    for both in [pair for pair in pairs if set(pair) <= set(results.methods)] or pairs[:1]:
         lines += [_fewer_views_in(results, role, *both) for role in _WHERE if results.scenes(role)]
     return lines
 

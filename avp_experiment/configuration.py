@@ -9,7 +9,7 @@ from typing import Any
 from avp_habitat import plugins
 from avp_habitat.errors import SceneError, UsageError, unknown_name
 from avp_habitat.simulators.registry import SimulatorChoice, open_simulator
-from avp_habitat.task.budget import VIEWS_PER_M2
+from avp_habitat.task.budget import views_for
 from avp_habitat.task.rewards import REWARDS
 
 TRAIN, UNSEEN = "train", "unseen"
@@ -148,7 +148,7 @@ class ExperimentPreset:
     reconstructed: int | None = None
     """So many seeds are reconstructed, the first start of each; None: everything."""
     model_geometry: bool = False
-    """Measure the geometry of reconstructions too."""
+    """Measure the geometry of reconstructions of whole episodes too."""
 
     def scaled(self, views: int, budget: int) -> int:
         """A number of views, stated for the preset's budget, for that of a scene."""
@@ -299,7 +299,7 @@ def _scene(
     opened = open_simulator(choice, spec)
     area_m2 = opened.area.area_m2
     if preset.benchmark and area_m2 > LARGE_M2:
-        budget = round(VIEWS_PER_M2 * area_m2)
+        budget = views_for(area_m2)
     scene = ExperimentScene(spec, opened.scene, opened.scene_digest, role, budget)
     opened.close()
     if fixed and scene.sha256 != fixed.sha256:

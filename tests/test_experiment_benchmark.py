@@ -74,7 +74,9 @@ def test_a_stated_part_is_reconstructed_with_its_own_geometry(benchmark, tmp_pat
     assert {(cell.method.name, cell.scene.spec) for cell in cells if cell.frames is None} == {
         (method, scene.spec) for method in ("nbv", "proposed_rooms") for scene in benchmark.scenes
     }
-    assert all(option(cell, "--scene") == cell.scene.spec for cell in cells)
+    # Nothing is told of the geometry of the others, and it takes half a minute.
+    assert all(option(cell, "--scene") == cell.scene.spec for cell in cells if cell.frames is None)
+    assert not any("--scene" in cell.words for cell in cells if cell.frames is not None)
 
 
 def test_what_was_known_of_presets_is_written_as_before_and_what_is_new_is_added(benchmark, tmp_path):

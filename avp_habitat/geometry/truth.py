@@ -9,7 +9,7 @@ from avp_habitat.errors import SimulatorError, UsageError
 from avp_habitat.geometry.shape import Shape
 from avp_habitat.poses import Intrinsics, wrap_angle
 from avp_habitat.scenes.mesh import without_holes
-from avp_habitat.sight.heldout import PLACES, heldout_poses, lookouts, lookouts_needed, steepest_elevation
+from avp_habitat.sight.heldout import PLACES, heldout_poses, in_reach, lookouts, lookouts_needed
 from avp_habitat.sight.tables import once_per_simulator
 from avp_habitat.simulators.base import Meshed, Simulator
 from avp_habitat.task.motion import sensor_poses
@@ -83,16 +83,9 @@ def scan_poses(simulator: Simulator, settings: TaskSettings, views: int = SCAN_V
 
 
 def observable(points: Float, whole: Shape, eyes: Float, settings: TaskSettings) -> NDArray[np.bool_]:
-    """`(n,)` which of `(n, 3)` points of a shape a camera at `lookouts_needed` of `(k, 3)` eyes can see.
-
-    The camera can turn to any yaw, so that only elevation limits it.
-    """
-    steepest = steepest_elevation(settings)
+    """`(n,)` which of `(n, 3)` points of a shape a camera at `lookouts_needed` of `(k, 3)` eyes can see."""
     count, needed = np.zeros(len(points), np.int64), lookouts_needed(len(eyes))
     for eye in eyes:
-        offset = points - eye
-        distance = np.linalg.norm(offset, axis=1)
-        within = (distance <= settings.max_range_m) & (np.abs(offset[:, 1]) <= np.sin(steepest) * distance)
-        asked = np.flatnonzero(within & (count < needed))
+        asked = np.flatnonzero(in_reach(points - eye, settings) & (count < needed))
         count[asked] += whole.reached(eye, points[asked], _TOLERANCE_M)
     return count >= needed

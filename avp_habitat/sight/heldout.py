@@ -65,14 +65,11 @@ def observable_poses(simulator: Simulator, settings: TaskSettings, *, views: int
     """
     # Not those of the other kind with more pitch.
     rng = np.random.default_rng([heldout_seed(simulator.scene_digest), 1])
-    eyes, steepest = lookouts(simulator, settings), steepest_elevation(settings)
+    eyes = lookouts(simulator, settings)
 
     def shown(pose: NDArray[np.float64], depth: NDArray[np.floating]) -> bool:
         points = heldout_points([(depth, pose)], _CAMERA, stride=_STRIDE).xyz
-        offset = points[None] - eyes[:, None]
-        distance = np.linalg.norm(offset, axis=-1)
-        within = (distance <= settings.max_range_m) & (np.abs(offset[..., 1]) <= np.sin(steepest) * distance)
-        pairs = np.argwhere(within)
+        pairs = np.argwhere(in_reach(points[None] - eyes[:, None], settings))
         seen = reached_around(simulator, eyes, points, pairs, tolerance_m=settings.tolerance_m)
         times = np.bincount(pairs[seen, 1], minlength=len(points))
         # Pixels that show no surface count, and are not shown from anywhere.
@@ -102,11 +99,15 @@ def lookouts_needed(count: int) -> int:
     return max(1, round(LEAST_SHARE * count))
 
 
-def steepest_elevation(settings: TaskSettings) -> float:
-    """The greatest elevation of a ray of the task's camera, radians: half its image's height beyond its pitch."""
+def in_reach(offset: NDArray[np.floating], settings: TaskSettings) -> NDArray[np.bool_]:
+    """`(…)` whether the task's camera, turned to any yaw, could show what lies `(…, 3)` metres from it.
+
+    Range and elevation limit it: half its image's height beyond the greatest pitch. What lies between is not asked.
+    """
     camera = settings.intrinsics
-    half = np.arctan(camera.height / 2 / camera.fy)
-    return float(min(np.radians(settings.pitch_limit_deg) + half, np.pi / 2))
+    steepest = min(np.radians(settings.pitch_limit_deg) + np.arctan(camera.height / 2 / camera.fy), np.pi / 2)
+    distance = np.linalg.norm(offset, axis=-1)
+    return (distance <= settings.max_range_m) & (np.abs(offset[..., 1]) <= np.sin(steepest) * distance)
 
 
 def _drawn(

@@ -12,10 +12,15 @@ BUDGET_HELP = f"steps, which are views; auto: {VIEWS_PER_M2:g} per m² of naviga
 """Help of the option `--budget`."""
 
 
+def views_for(area_m2: float) -> int:
+    """What `auto` gives a scene with so much navigable floor."""
+    return min(max(round(VIEWS_PER_M2 * area_m2), LEAST), MOST)
+
+
 def budget_for(budget: Budget, area_m2: float) -> int:
     """The number itself, or what `auto` gives a scene with so much navigable floor; then it says so in one line."""
     if budget != "auto":
         return budget
-    views = min(max(round(VIEWS_PER_M2 * area_m2), LEAST), MOST)
+    views = views_for(area_m2)
     print(f"budget: {views} views for {area_m2:.1f} m² of floor", flush=True)
     return views
