@@ -6,6 +6,7 @@ import zlib
 
 import numpy as np
 from PIL import Image
+from scipy import stats
 
 METHODS = {
     "heuristic": (80, 0.2, 13.0),
@@ -23,6 +24,8 @@ METHODS = {
 """Views, final coverage and PSNR in the scene of training, before what is drawn at random for seed and start."""
 LEARNED = ("coverage", "coverage_redundancy", "proposed", "surface", "proposed_rooms", "surface_rooms")
 SCENES = ({"name": "white.glb", "sha256": "a", "role": "train"}, {"name": "grey.glb", "sha256": "b", "role": "unseen"})
+FEW = ("heuristic", "coverage", "proposed", "surface")
+TRAIN_ONLY = SCENES[:1]
 HELDOUT = 6
 
 
@@ -171,3 +174,19 @@ def _map(rng, views):
         "floor": base64.b64encode(zlib.compress(numbers.tobytes())).decode("ascii"),
         "path": [[float(px), float(pz), float(turn)] for (px, pz), turn in zip(path, angle, strict=True)],
     }
+
+
+def by_seed(parts, value, **wanted):
+    """Means of a figure by seed, computed without the report's code."""
+    found = {}
+    for part in parts:
+        if all(part[name] == wish for name, wish in wanted.items()):
+            found.setdefault(part["seed"], []).append(value(part))
+    return [sum(values) / len(values) for values in found.values()]
+
+
+def interval(values):
+    """Mean and half width of the 95 % interval, as SciPy computes it."""
+    mean = float(np.mean(values))
+    low, high = stats.t.interval(0.95, len(values) - 1, loc=mean, scale=stats.sem(values))
+    return mean, (high - low) / 2

@@ -5,11 +5,9 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
 import pytest
-from experiment_results import SCENES, make_results, write_results
+from experiment_results import FEW, TRAIN_ONLY, by_seed, interval, make_results, write_results
 from PIL import Image
-from scipy import stats
 
 from avp_experiment import plots
 from avp_experiment.pictures import maps
@@ -20,9 +18,7 @@ from avp_habitat.errors import AVPError, UsageError
 from avp_habitat.metrics import Figure
 
 ROOT = Path(__file__).resolve().parent.parent
-FIGURES = ("figure3", "figure4", "figure5", "figure6", "figure6_unseen", "psnr_by_views", "visibility")
-FEW = ("heuristic", "coverage", "proposed", "surface")
-TRAIN_ONLY = SCENES[:1]
+FIGURES = ("figure3", "figure4", "figure5", "figure6", "figure6_unseen", "psnr_by_views", "budgets", "visibility")
 
 
 @pytest.fixture(scope="module")
@@ -49,22 +45,6 @@ def report(tmp_path, monkeypatch):
 def rows_of(path):
     with path.open(newline="", encoding="utf-8") as file:
         return {row["method"]: row for row in csv.DictReader(file)}
-
-
-def by_seed(parts, value, **wanted):
-    """Means of a figure by seed, computed without the report's code."""
-    found = {}
-    for part in parts:
-        if all(part[name] == wish for name, wish in wanted.items()):
-            found.setdefault(part["seed"], []).append(value(part))
-    return [sum(values) / len(values) for values in found.values()]
-
-
-def interval(values):
-    """Mean and half width of the 95 % interval, as SciPy computes it."""
-    mean = float(np.mean(values))
-    low, high = stats.t.interval(0.95, len(values) - 1, loc=mean, scale=stats.sem(values))
-    return mean, (high - low) / 2
 
 
 @pytest.mark.parametrize(("table", "role"), [("table2", "train"), ("table3", "unseen")])
@@ -142,128 +122,6 @@ def test_what_was_read_by_hand_becomes_part_of_the_page(report, tmp_path):
     (tmp_path / "reading.md").write_text("# What this shows\n\nA room of one's own.\n")
     page = (report(make_results(FEW)) / "results.md").read_text()
     assert "## What this shows\n\nA room of one's own." in page
-
-
-def section(folder, title):
-    return (folder / "claims.md").read_text().partition(f"## {title}")[2].partition("\n## ")[0]
-
-
-def change(results, method, **by):
-    """Add to views or PSNR, or multiply coverage, of all episodes of a method."""
-    for one in results["rollouts"]:
-        if one["method"] == method:
-            one["metrics"]["views"] += by.get("views", 0)
-            one["metrics"]["coverage"] *= by.get("coverage", 1)
-    for one in results["reconstructions"]:
-        if one["method"] == method:
-            one["scores"]["psnr"] += by.get("psnr", 0)
-
-
-@pytest.mark.parametrize(
-    ("method", "by", "words"),
-    [
-        ("heuristic", {}, "the heuristic is clearly below every learned policy in coverage and PSNR"),
-        ("heuristic", {"psnr": 20}, "the heuristic is **not** below every learned policy in coverage and PSNR"),
-        ("heuristic", {"coverage": 5}, "the heuristic is **not** below"),
-        ("surface", {"psnr": -8.2}, "not every difference has an interval above 0"),
-    ],
-)
-def test_the_heuristic_is_called_worse_only_where_it_is(report, method, by, words):
-    results = make_results(FEW, scenes=TRAIN_ONLY)
-    change(results, method, **by)
-    assert words in section(report(results), "Heuristic")
-
-
-@pytest.mark.parametrize(
-    ("by", "words"),
-    [
-        ({"psnr": 2}, "**holds**, also at the unfavourable ends"),
-        ({"psnr": 0.1}, "**holds** by the means, not over the whole intervals"),
-        ({"psnr": -2}, "**does not hold**"),
-        ({"psnr": 2, "views": 20}, "**does not hold**"),
-    ],
-)
-def test_fewer_views_at_equal_psnr_holds_only_where_it_does(report, by, words):
-    results = make_results(FEW, scenes=TRAIN_ONLY)
-    # Less scatter between seeds, so that the whole interval of the views lies on one side.
-    for one in results["rollouts"]:
-        if one["method"] == "proposed":
-            one["metrics"]["views"] = 54.0 + one["seed"]
-    change(results, "proposed", **by)
-    said = section(report(results), "`proposed` against `coverage`")
-    assert words in said
-    share = np.mean([1 - (54 + seed + by.get("views", 0)) / 80 for seed in range(3)])
-    assert f"takes {100 * share:.1f} ± " in said
-
-
-def test_surface_is_compared_at_equal_views_and_at_equal_psnr(report):
-    results = make_results(("proposed", "surface"), scenes=TRAIN_ONLY, starts=1, prefixes=(20, 40))
-    exact = {"proposed": {20: 10.0, 40: 14.0, 50: 15.0}, "surface": {20: 12.0, 40: 16.0, 60: 18.0}}
-    for one in results["reconstructions"]:
-        one["views"] = {"proposed": 50, "surface": 60}[one["method"]]
-        one["frames"] = one["views"] if one["whole"] else one["frames"]
-        one["scores"]["psnr"] = exact[one["method"]][one["frames"]] + 0.5 * one["seed"]
-    said = section(report(results), "`surface` against")
-    # At 50 views surface lies half way between 16 and 18, proposed at 15; 15 is three quarters of the way to 16.
-    assert "differs by +2.00 ± 0.00 dB: higher, the whole interval too" in said
-    assert (
-        "reached by `surface` after 35.0 ± 0.0 views where `proposed` took 50.0 ± 0.0: +15.0 ± 0.0 views saved." in said
-    )
-    assert "The final PSNR of `surface` is reached by `proposed` in none of 3 episodes: never reached." in said
-    change(results, "surface", psnr=-6)
-    assert "differs by -4.00 ± 0.00 dB: lower, the whole interval too" in section(report(results), "`surface` against")
-
-
-def test_the_correlation_is_that_of_scipy_and_called_what_it_is(report):
-    results = make_results(FEW, scenes=TRAIN_ONLY)
-    known = [(one["visibility"], one["scores"]["psnr"]) for one in results["reconstructions"]]
-    rho = stats.spearmanr(*zip(*known, strict=True))[0]
-    said = section(report(results), "What predicts PSNR")
-    assert f"visibility predicts PSNR best: ρ = {rho:.2f} [" in said
-    for one in results["reconstructions"]:
-        one["scores"]["psnr"] = 30 * one["visibility"]
-    assert "best: ρ = 1.00 [1.00, 1.00], at least 0.8" in section(report(results), "What predicts PSNR")
-    for one in results["reconstructions"]:
-        one["scores"]["psnr"] = -one["scores"]["psnr"]
-    assert "best: ρ = -1.00 [-1.00, -1.00], below 0.8" in section(report(results), "What predicts PSNR")
-
-
-def test_what_predicts_best_is_named_whichever_it_is(report):
-    results = make_results(FEW, scenes=TRAIN_ONLY)
-    rng = np.random.default_rng(3)
-    for one in results["rollouts"]:
-        one["visibility_curve"] = list(rng.random(len(one["visibility_curve"])))
-        one["coverage_curve"] = list(rng.random(len(one["coverage_curve"])))
-        one["parallax_curve"] = list(rng.random(len(one["parallax_curve"])))
-    known = {(one["method"], one["seed"], one["start"]): one for one in results["rollouts"]}
-    for one in results["reconstructions"]:
-        found = known[one["method"], one["seed"], one["start"]]
-        geometry = found["metrics"] if one["whole"] else found["geometry_after"][str(one["frames"])]
-        one["scores"]["psnr"] = geometry["completion_ratio"]
-    assert "completion ratio predicts PSNR best: ρ = 1.00" in section(report(results), "What predicts PSNR")
-
-
-def test_the_tables_by_budget_hold_what_was_known_then(report):
-    results = make_results(("greedy", "proposed"))
-    method = results["methods"][1]
-    page = (report(results) / "results.md").read_text()
-    found = [one for one in results["rollouts"] if one["method"] == method and one["role"] == "unseen"]
-    cells = []
-    for views in (20, 40, 60, 80):
-        values = by_seed(
-            found, lambda one, views=views: 100 * one["visibility_curve"][min(views, len(one["visibility_curve"])) - 1]
-        )
-        mean, half = interval(values)
-        cells.append(f"{mean:.1f} ± {half:.1f}")
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in page.splitlines() if "|" in line]
-    assert ["method", "20 views", "40 views", "60 views", "80 views"] in rows
-    assert [method, *cells] in rows
-
-
-def test_a_failed_cell_is_named_with_its_reason(report):
-    results = make_results(FEW)
-    results["failed"] = [{"cell": "train/surface-1", "reason": "exit code 1: no memory", "log": "cells/log.txt"}]
-    assert "`train/surface-1`: exit code 1: no memory" in section(report(results), "Cells that failed")
 
 
 def without(part, **wanted):
@@ -436,65 +294,3 @@ def test_a_folder_that_is_none_is_refused_by_the_function_too(tmp_path):
     (tmp_path / "results.json").mkdir()
     with pytest.raises(AVPError):
         read_results(tmp_path)
-
-
-def test_geometry_after_a_part_is_not_told_of_those_alone_that_have_ended(report):
-    results = make_results(("greedy", "proposed"))
-    for one in results["rollouts"]:
-        one["geometry_after"] = {key: value for key, value in one["geometry_after"].items() if key == "40"}
-    page = (report(results) / "results.md").read_text()
-    lines = page.partition("completion ratio [%], unseen scenes:")[2].splitlines()
-    assert [cell.strip() for cell in lines[2].strip("|").split("|")] == ["method", "40 views", "80 views"]
-
-
-def test_a_predictor_that_few_have_is_left_out_and_not_the_reconstructions(report):
-    results = make_results(FEW, scenes=TRAIN_ONLY)
-    for one in results["rollouts"]:
-        one["geometry_after"] = None
-    said = section(report(results), "What predicts PSNR")
-    assert "completion ratio" not in said
-    assert f" {len(results['reconstructions'])} |" in said
-
-
-def test_a_method_without_a_scene_is_told_and_scenes_count_alike(report):
-    results = make_results(("greedy", "proposed"), seeds=2)
-    gone = {"method": "greedy", "scene": "grey.glb"}
-    for part in ("rollouts", "reconstructions"):
-        results[part] = [one for one in results[part] if any(one[name] != value for name, value in gone.items())]
-    results["configuration"]["scenes"][0] = {**results["configuration"]["scenes"][0], "role": "unseen"}
-    for part in ("rollouts", "reconstructions"):
-        for one in results[part]:
-            one["role"] = "unseen"
-    folder = report(results)
-    assert "greedy: without grey.glb, so that its means are of other scenes." in (folder / "table3.md").read_text()
-
-
-def test_parts_of_different_budgets_stand_at_the_same_place(tmp_path):
-    results = make_results(("greedy",), seeds=2, starts=1, prefixes=(40,))
-    scenes = [{**scene, "role": "unseen"} for scene in SCENES]
-    scenes[1]["budget"] = 160
-    results["configuration"]["scenes"] = scenes
-    for part in ("rollouts", "reconstructions"):
-        for one in results[part]:
-            one["role"] = "unseen"
-    for one in results["reconstructions"]:
-        if one["scene"] == "grey.glb":
-            one["views"] = 160
-            one["frames"] = 160 if one["whole"] else 80
-    found = read_results(write_results(tmp_path, results))
-    axes = plots.psnr_by_views(found).picture.axes[0]
-    assert axes.lines[0].get_xdata().tolist() == [50.0, 100.0]
-
-
-def test_each_unseen_scene_has_its_own_completion_ratio_and_psnr(report):
-    results = make_results(FEW)
-    page = (report(results) / "results.md").read_text().partition("## By scene")[2]
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in page.splitlines() if "|" in line]
-    for part, value in (
-        ("rollouts", lambda one: 100 * one["metrics"]["completion_ratio"]),
-        ("reconstructions", lambda one: one["scores"]["psnr"]),
-    ):
-        whole = {"whole": True} if part == "reconstructions" else {}
-        mean, half = interval(by_seed(results[part], value, method="proposed", scene="grey.glb", **whole))
-        digits = 1 if part == "rollouts" else 2
-        assert ["proposed", f"{mean:.{digits}f} ± {half:.{digits}f}"] in rows
