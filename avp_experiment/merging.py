@@ -161,7 +161,9 @@ def _configuration(several: Sequence[Results]) -> dict[str, Any]:
         if told:
             other = first.configuration.get("preset") != results.configuration.get("preset")
             what = "presets or versions of a benchmark" if other else "settings"
-            raise UsageError(f"{told}: results of different {what} cannot be merged")
+            # Two presets differ in much: their names say it.
+            said = told.partition("; ")[0] if other else told
+            raise UsageError(f"{said}: results of different {what} cannot be merged")
     for name in ("rooms", "metrics"):
         if union := dict.fromkeys(one for results in several for one in results.configuration.get(name, ())):
             found[name] = list(union)
